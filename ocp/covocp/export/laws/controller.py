@@ -47,14 +47,14 @@ from covocp.statement.statement import Statement
 
 # What is kept of a step that is under way, and after a reading that did not come.
 ABOUT_KEPT = {
-    "length": "of the last step, and so what is expected of the coming one; 0 before the first one: set it after init where "
-    "it is known, and call the first step at time zero",
+    "length": "of the last step, and so what is expected of the coming one; 0 before the first one: set it after init "
+    "where it is known, and call a first step at time zero",
     "elapsed": "how long a step has been under way that goes on after a node; 0 between two calls",
     "expected": "integral of what is to be measured since a step that is under way began; 0 between two calls",
     "spread": "half-vector of the covariance of the errors of estimate and integral, which counts in the place of E of "
     "the design within a step, and where overdue is 1",
-    "overdue": "1 where the variances of the estimate are not those of the design, as a row of the measurement did not come "
-    "or a step was long: the next step begins with spread then",
+    "overdue": "1 where the variances of the estimate are not those of the design, as a row of the measurement did not "
+    "come or a step was long: the next step begins with spread then",
 }
 STATUSES = (
     "OK", "MEASUREMENT_MISSING", "TIME_BEFORE", "TIME_AFTER", "TIME_BACKWARDS", "TIME_NOT_FINITE", "ESTIMATE_LOST",
@@ -64,8 +64,8 @@ HELD = {
     "estimate": "estimate", "last": "time", "held": "control", "length": "length", "elapsed": "elapsed",
     "expected": "expected", "spread": "spread", "overdue": "overdue",
 }  # fmt: skip
-# Variances of the error that differ from those of the design by this share of them, or by this share of the largest ones
-# on the way, are no others: the design counts.
+# Variances of the error that differ from those of the design by this share of them, or by this share of the largest
+# ones on the way, are no others: the design counts.
 NEAR, SLIGHT = 1e-2, 1e-6
 # A length of a step by which anything may be divided, in single precision too.
 SHORTEST = 1e-30
@@ -75,13 +75,15 @@ ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call, so it is the mean of the "
     "nominal control over the coming step, taken to be as long as the last one, u_mean - C y. Before the first step no "
     "length is known and it is the nominal control of time zero; where steps differ in length the control is early or "
-    "late by half of their difference: the estimate knows it, and the feedback acts on it. From the last call at s to this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
+    "late by half of their difference: the estimate knows it, and the feedback acts on it. From the last call at s to "
+    "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
     "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h. The "
     "measurement m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, "
     "a' = h(x, u) + M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A "
     "the covariance of the error of a (U h of noise in it), B that between it and the estimate's: from E(s) of the "
     "design by P' = F P + P F' + Q. To first order L is h P M' (h M P M' + U)^-1.",
-    "A row of the measurement that is not finite is left out, and what is known without it is kept for the next steps; readings beyond 1e30 count as not finite. The first "
+    "A row of the measurement that is not finite is left out, and what is known without it is kept for the next steps; "
+    "readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
 ABOUT_INSTANTS = (

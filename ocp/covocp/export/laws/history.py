@@ -128,21 +128,24 @@ class History:
     def mean_control(self, begin: Expr, end: Expr) -> Any:
         """The mean of the control between two times within [0, T], (nu,), that at `begin` where no time lies between.
 
-        Exact for controls that are constant or linear in each interval. Over whole intervals it is had from a table of
-        integrals; within one it is the value halfway, which does not cancel.
+        Exact for controls that are constant or linear in each interval: to the value halfway within the first one comes
+        what the control differs from it later, over whole intervals from a table of integrals, about the mean of all.
         """
         first, last = _piece(self.nodes, begin), _piece(self.nodes, ca.fmax(begin, end))
         nodes, lengths = ca.MX(ca.DM(self.nodes)), np.diff(self.nodes)[:, None]
         starts, ends = self.u[: lengths.size], self.u_ends
-        integrals = np.vstack([np.zeros((1, self.u.shape[1])), np.cumsum(lengths / 2 * (starts + ends), axis=0)])
+        parts = lengths / 2 * (starts + ends)
+        mean = parts.sum(axis=0, keepdims=True) / lengths.sum()
+        integrals = np.vstack([0.0 * mean, np.cumsum(parts - lengths * mean, axis=0)])
         split = last > first
         until = ca.if_else(split, nodes[first + 1], ca.fmax(begin, end))
         halfway = _control(self, first, (begin + until) / 2)
         since = nodes[last]
         rest = _control(self, last, (since + end) / 2)
         between = _column(integrals, last) - _column(integrals, first + 1)
-        whole = ((until - begin) * halfway + between + (end - since) * rest) / ca.if_else(split, end - begin, 1.0)
-        return ca.if_else(split, whole, halfway)
+        between += (since - nodes[first + 1]) * (ca.DM(mean.T) - halfway)
+        more = (between + (end - since) * (rest - halfway)) / ca.if_else(split, end - begin, 1.0)
+        return halfway + ca.if_else(split, more, 0.0)
 
     def rows(self, t: Array) -> tuple[Array, Array, Array]:
         """x, u, e at some times, a row for each."""

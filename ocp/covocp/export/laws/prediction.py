@@ -2,8 +2,9 @@
 
 At its nodes the control of the nominal jumps or has a kink, and with it the slopes along the nominal may: a rule of
 integration that has two points in a step does not see that. So a step ends at the next node where one lies before its
-end, and goes on from there; and before it where modes are faster than that (`paces`). What is predicted to a node is kept until the step is done: the estimate, the integral of
-what is to be measured, the covariance of the errors of both, and the time that has gone.
+end, and goes on from there; and before it where modes are faster than that (`paces`). What is predicted to a node is
+kept until the step is done: the estimate, the integral of what is to be measured, the covariance of the errors of both,
+and the time that has gone.
 """
 
 from __future__ import annotations
@@ -72,8 +73,8 @@ class Ahead(NamedTuple):
 def predicted(design: Design, tables: History, ahead: Ahead, held: Expr, piece: Piece) -> Ahead:
     """What a piece makes of it, computed in units of typical deviations.
 
-    The covariance is that of the Gauss method for P' = A P + P A' + diag(Q, U), A of deviation and integral: transitions
-    from start and nodes to the end, between which noise enters at the nodes. It is semidefinite at any length, and
+    The covariance is that of the Gauss method for P' = A P + P A' + diag(Q, U), A of deviation and integral:
+    transitions from the start, and from the two nodes, where the noise enters. It is semidefinite at any length, and
     keeps what is stationary.
 
     Args:

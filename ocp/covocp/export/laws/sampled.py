@@ -64,9 +64,9 @@ ABOUT = (
     "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the "
     "nearest sample; samples that were left out are predicted over, one loop for each, and the status says so, as the "
     "gain is that of one period. The control returned is held until the next call, so it is the mean of the nominal "
-    "control over the coming period, u_mean - C y. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
-    "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
-    "period. The measurement m is the mean of what is measured since the last call, and is "
+    "control over the coming period, u_mean - C y. The estimate y of the deviation from the nominal is predicted by "
+    "Phi y + Gamma u_held + g and corrected by L (m - what is expected), L of the discrete filter whose measurements "
+    "have the noise of one period. The measurement m is the mean of what is measured since the last call, and is "
     "compared with the mean that is expected up to the sample: a call that is late by d is told h' d more than that, "
     "and takes it for a deviation.",
     "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then "

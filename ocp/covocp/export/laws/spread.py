@@ -63,8 +63,8 @@ def check_lag(solution: Solution, samples: Samples) -> None:
     if share[k, row] > LARGEST_LAG:
         warn_user(
             f"With its control held over {samples.period:g} s the loop flies beside the nominal: the mean of "
-            f"'{solution.augmented[row]}' is off by {samples.lag[k, row]:.4g} at t = {samples.times[k]:.4g} s, where its "
-            f"standard deviation is {expected[k, row]:.4g} as predicted; a shorter period= halves it, or more."
+            f"'{solution.augmented[row]}' is off by {samples.lag[k, row]:.4g} at t = {samples.times[k]:.4g} s, where "
+            f"its standard deviation is {expected[k, row]:.4g} as predicted; a shorter period= halves it, or more."
         )
 
 
