@@ -66,14 +66,18 @@ def test_a_reading_is_weighed_by_what_is_known_without_those_that_did_not_come(g
     assert late or float(law.state["filter_gain"]) == pytest.approx(_gains(*given)[-1], rel=1e-9, abs=1e-15)
 
 
-def test_after_an_instant_with_its_reading_the_design_counts_again() -> None:
+def test_the_design_counts_where_it_is_what_is_known() -> None:
     law = _law()
     law.step(np.nan, 0.0)
     assert (law.status, law.state["overdue"]) == ("MEASUREMENT_MISSING", 1)
     law.step(np.nan, 0.5)
     assert (law.status, law.state["overdue"]) == ("OK", 1)
     law.step(0.9, 1.0)
-    assert (law.status, law.state["overdue"]) == ("OK", 0)
+    assert (law.status, law.state["overdue"]) == ("OK", 1)  # it knows 0.091, the design 0.050
+    law.init()
+    for time, reading, own in ((0.0, 0.9, 0), (0.5, np.nan, 0), (1.0, np.nan, 1), (1.0, 0.9, 0)):
+        law.step(reading, time)
+        assert law.state["overdue"] == own
 
 
 def test_with_a_period_a_reading_counts_at_its_sample_alone_and_once() -> None:

@@ -56,6 +56,20 @@ def test_the_gain_is_that_of_the_rows_that_are_there(wrong):
         held = float(state["control"])
 
 
+def test_between_any_times_what_is_known_without_a_row_is_kept() -> None:
+    """Steps of a period without one: the gains of the filter that never had the rows, not of the design."""
+    controller = export_c(swing(), FOLDER / "swing_any").reference()["step"]
+    own = means.told(F, G[:, None], M, H[:, None], SWING.Q, SWING.U, 0.2)
+    P = SWING.P0
+    for k, rows in enumerate([(), (), (1,), (), (0, 1, 2), (2,)]):
+        there = np.isin(np.arange(3), rows)
+        controller.step(np.where(there, 0.1, np.nan), 0.2 * (k + 1))
+        L = means.filtered(P, own, there)[0]
+        joint = own.state @ P @ own.state.T + own.noise
+        P = joint[:2, :2] - L @ joint[2:, :2]
+        np.testing.assert_allclose(controller.state["filter_gain"], L, rtol=0, atol=2e-5 * max(1.0, np.abs(L).max()))
+
+
 def test_c_and_python_agree_with_missing_rows():
     check = package("swing").check()
     assert check.ok, str(check)

@@ -10,6 +10,7 @@ import phased_loops
 import pytest
 from exports import FOLDER, QUICK
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 import covocp as co
 from covocp.export import CPackage, export_c
@@ -130,6 +131,12 @@ def _predicted(phase: co.Solution, name: str, y: np.ndarray, held: float, begin:
     return solve_ivp(rate, (begin, end), y, rtol=1e-10, atol=1e-13).y[:, -1]
 
 
+def _mean(phase: co.Solution, name: str, begin: float, end: float) -> float:
+    """Of a control that is linear between the nodes."""
+    ends = np.unique([begin, *(t for t in phase.t if begin < t < end), min(end, phase.duration)])
+    return float(np.trapezoid(np.ravel(phase.at(ends)[name]), ends) / (ends[-1] - begin))
+
+
 def _joined(phase: co.Solution, z: np.ndarray, held: float, end: float) -> np.ndarray:
     """Deviation of what rises, and integrals of place and speed as they are expected, from its beginning."""
 
@@ -161,8 +168,11 @@ def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> No
     Phi = np.column_stack([_joined(rise, c, 0, h) for c in np.eye(7)]) - _joined(rise, np.zeros(7), 0, h)[:, None]
     P, M, Q, U = np.zeros((7, 7)), np.eye(5)[:2], np.diag([0.01, 0.02, 0.05, 0.0, 0.0]), np.diag([0.1, 0.2])
     P[:5, :5] = rise.values["E"][0]
-    even = np.block([[h * Q, h**2 / 2 * Q @ M.T], [h**2 / 2 * M @ Q, h**3 / 3 * M @ Q @ M.T + h * U]])
-    P = Phi @ P @ Phi.T + even
+    F = np.zeros((7, 7))
+    F[:5, :5], F[5:, :5] = _slopes(rise, h / 2)[0], M  # what noise makes while F is nearly constant
+    density = np.block([[Q, np.zeros((5, 2))], [np.zeros((2, 5)), U]])
+    loan = expm(h * np.block([[-F, density], [np.zeros((7, 7)), F.T]]))
+    P = Phi @ P @ Phi.T + loan[7:, 7:].T @ loan[:7, 7:]
     at = rise.at(h)
     reading = np.array([float(at["x"]) + 0.2, float(at["v"]) - 0.3])
     y = z[:5] + h * P[:5, 5:] @ np.linalg.inv(P[5:, 5:]) @ (reading - z[5:] / h)
@@ -170,7 +180,8 @@ def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> No
     assert (step.status, step.state["phase"]) == ("OK", 1)
     np.testing.assert_allclose(step.estimate, y, rtol=1e-6, atol=1e-8)
     C = rise.at(h)["S"][1] @ np.eye(5)
-    assert float(control[0]) == pytest.approx(float(at["w"]) - float(C @ y), abs=1e-6)
+    mean = _mean(rise, "w", h, h + 0.03)  # the last step began at 0.99
+    assert float(control[0]) == pytest.approx(mean - float(C @ y), abs=1e-6)
 
 
 def test_a_step_where_phases_meet_takes_the_reading_of_the_one_that_ends() -> None:
@@ -189,7 +200,7 @@ def test_a_step_where_phases_meet_takes_the_reading_of_the_one_that_ends() -> No
     assert laws[0].status == "OK"
     assert (laws[0].state["phase"], laws[0].state["time"]) == (1, 1.0)
     np.testing.assert_allclose(laws[0].estimate, y, rtol=1e-9, atol=1e-12)
-    assert float(control[0]) == pytest.approx(float(rise["w"][0] - rise.gains["C"][0, 0] @ y), rel=1e-9)
+    assert float(control[0]) == pytest.approx(_mean(rise, "w", 0.0, 0.05) - float(rise.gains["C"][0, 0] @ y), rel=1e-9)
     again = laws[0].step([5.0, 5.0], 1.0)
     np.testing.assert_allclose(again, control, rtol=1e-12)
     np.testing.assert_allclose(laws[0].estimate, y, rtol=1e-9, atol=1e-12)
@@ -415,6 +426,8 @@ def _filtered(solution: co.PhasesSolution, measures: list[bool], readings: np.nd
     phi, y, held, found = np.exp(RATE * SIDE), 0.0, float(solution[0]["u"][0]), []
     nodes, weights = np.polynomial.legendre.leggauss(5)
     slope = (phi - 1.0) / RATE  # of the integral of the deviation over a step
+    F, E = np.array([[RATE, 0.0], [1.0, 0.0]]), 0.0
+    loan = expm(SIDE * np.block([[-F, np.diag([MOVED, SEEN])], [np.zeros((2, 2)), F.T]]))
     for k, reading in enumerate(readings):
         phase, begin = k // 20, (k % 20) * SIDE
         inside = SIDE * (1.0 + nodes) / 2.0
@@ -424,12 +437,16 @@ def _filtered(solution: co.PhasesSolution, measures: list[bool], readings: np.nd
         seen = SIDE / 2.0 * seen + slope * y
         y = phi * y + SIDE / 2.0 * float(weights @ (np.exp(RATE * on) * moved))
         if measures[phase]:
-            across = slope * phi * errors[k] + MOVED * SIDE**2 / 2.0
-            L = SIDE * across / (slope**2 * errors[k] + MOVED * SIDE**3 / 3.0 + SEEN * SIDE)
+            if k % 20 == 0 or abs(E / errors[k] - 1.0) < 1e-2:
+                E = errors[k]  # what is known is what the design expects
+            P = loan[2:, 2:].T @ np.diag([E, 0.0]) @ loan[2:, 2:] + loan[2:, 2:].T @ loan[:2, 2:]
+            L, E = SIDE * P[0, 1] / P[1, 1], P[0, 0] - P[0, 1] ** 2 / P[1, 1]
             y += L * (reading - seen / SIDE)
         y *= TURN if k == 19 else 1.0
         now, node = (phase + 1, 0) if k in (19, 39) else (phase, k % 20 + 1)
-        held = float(solution[now]["u"][node]) - S[now, node] * y
+        begin = solution[now].t[0] + (0.0 if node == 0 else begin + SIDE)
+        mean = _mean(solution[now], "u", begin, begin + SIDE) if begin < 1.0 - 1e-9 else float(solution[now]["u"][-1])
+        held = mean - S[now, node] * y
         found.append([held, y])
     return np.array(found)
 

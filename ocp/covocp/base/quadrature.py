@@ -115,7 +115,7 @@ def gauss_stages(
     """A step as `gauss_step` takes it, with y and its transition at the two nodes: their mean integrates y.
 
     Args:
-        points, forcing, start, unit, solve: as of `gauss_step`.
+        points, forcing, start, unit, solve: as of `gauss_step`; of several y, a column of each.
 
     Returns:
         Of y, and of the transition from the start: values at the first and the second node, change over the step.
@@ -124,7 +124,7 @@ def gauss_stages(
     first, second = forcing
     ahead = start + GAP * first
     stages = solve(matrix, ca.horzcat(left @ ahead + SHARE / 2 * (first + second), left))
-    y, transition = stages[:, 0], stages[:, 1:]
+    y, transition = stages[:, : start.shape[1]], stages[:, start.shape[1] :]
     change, turn = (right @ y - ahead) / SHARE, (right @ transition - unit) / SHARE
     return (y, y + 2 * GAP * change, change), (transition, transition + 2 * GAP * turn, turn)
 

@@ -31,7 +31,7 @@ from covocp.export.laws.phase_controller import check_first_readings, legs_of, p
 from covocp.export.laws.phases import histories
 from covocp.export.laws.sampled import discretised, sampled_law
 from covocp.export.laws.solver import OPTIONS, solver_law
-from covocp.export.laws.spread import LARGEST_SPREAD, check_flight, sampled_flight
+from covocp.export.laws.spread import LARGEST_SPREAD, check_flight, check_lag, sampled_flight
 from covocp.export.laws.trajectory import sample_law
 from covocp.export.text.casadi_code import Generated, Sizes, generate
 from covocp.export.text.collisions import check_identifiers
@@ -243,6 +243,7 @@ def _solution(
         else:
             samples = discretised(design, tables, _positive("period", period))
             check_flight(sampled_flight(solution, samples), largest_spread, period)
+            check_lag(solution, samples)
             laws.append(sampled_law(design, tables, samples, tolerance))
     elif period is not None or limits is not None:
         raise _no_controller("period= and limits= are", solution.name, feedback)

@@ -1,26 +1,29 @@
 """Perturbation filter and feedback of a closed loop as a law, for any time between two steps.
 
-The control that a step returns is held until the next one. A step from time s to t = s + h, with y the estimate of the
+The control that a step returns is held until the next one, so it is the mean of the nominal control over the step that
+comes, taken to be as long as the last one, and the feedback of the estimate: the nominal at the time of the call, held,
+would be half a step behind. A step from time s to t = s + h, with y the estimate of the
 deviation from the nominal, computes
 
     y- :  y' = F y + G (u_held - u(time)) over [s, t], a step of the two-stage Gauss method from each node of the mesh
           to the next (`prediction`): order 4 where u jumps or has kinks too, stable for any h
     a  :  a' = h(x, u) + M y- + H (u_held - u), from a(s) = 0: what is to be measured, integrated by the same stages
-    P- :  P <- Phi P Phi' + d Q              of the error before the measurement, from E(s) of the design over the same
-                                             pieces, of lengths d and transitions Phi
+    P- :  P' = F P + P F' + Q                of the error before the measurement, from E(s) of the design, by the same
+                                             stages
     A, B                                     covariance of the error of a, the noise of the measurement included, and
                                              between those of y- and a
     L  =  h B A^-1                           best gain of the mean of the measurement; h P- M' (h M P- M' + U)^-1 and
                                              K h to first order. It never adds to P-: stable for any h, and right where
                                              a first measurement tells more than all that was known before
     y+ =  y- + L (m - a/h)
-    u  =  u(t) - C y+,                       within the limits, where there are some
+    u  =  mean of u over [t, t + h] - C y+,  within the limits, where there are some
 
 with F, G, Q, M, H, U and the measurement h expected there from the model's own functions along the nominal, and C at t.
 A measurement m stands for the h seconds before it: it is the mean over them, white noise of density U included, and is
 compared with the mean that is expected (at the end of a step the nominal is half a step ahead of it). What is read at
-an instant is compared with what is expected then, m - h - M y- - H (u_held - u), and has its variance. Where it did not
-come E of the design is not what is known: P is kept then.
+an instant is compared with what is expected then, m - h - M y- - H (u_held - u), and has its variance. Where a
+row did not come, or a mean over a long step tells less than all that was measured in it, E of the design is not what is
+known: P is kept where it is another, and the next step begins with it.
 """
 
 from __future__ import annotations
@@ -42,36 +45,45 @@ from covocp.export.laws.trajectory import times
 from covocp.statement.entries import entry_names, error_names
 from covocp.statement.statement import Statement
 
-# What is kept of a step that is under way, and after an instant at which a reading did not come.
+# What is kept of a step that is under way, and after a reading that did not come.
 ABOUT_KEPT = {
+    "length": "of the last step, and so what is expected of the coming one; 0 before the first one: set it after init "
+    "where it is known, and call a first step at time zero",
     "elapsed": "how long a step has been under way that goes on after a node; 0 between two calls",
     "expected": "integral of what is to be measured since a step that is under way began; 0 between two calls",
     "spread": "half-vector of the covariance of the errors of estimate and integral, which counts in the place of E of "
     "the design within a step, and where overdue is 1",
-    "overdue": "1 where something that is read at an instant did not come, until all that is due at a later one does",
+    "overdue": "1 where the variances of the estimate are not those of the design, as a row of the measurement did not "
+    "come or a step was long: the next step begins with spread then",
 }
 STATUSES = (
     "OK", "MEASUREMENT_MISSING", "TIME_BEFORE", "TIME_AFTER", "TIME_BACKWARDS", "TIME_NOT_FINITE", "ESTIMATE_LOST",
     "FAILED",
 )  # fmt: skip
 HELD = {
-    "estimate": "estimate", "last": "time", "held": "control", "elapsed": "elapsed", "expected": "expected",
-    "spread": "spread", "overdue": "overdue",
+    "estimate": "estimate", "last": "time", "held": "control", "length": "length", "elapsed": "elapsed",
+    "expected": "expected", "spread": "spread", "overdue": "overdue",
 }  # fmt: skip
+# Variances of the error that differ from those of the design by this share of them, or by this share of the largest
+# ones on the way, are no others: the design counts.
+NEAR, SLIGHT = 1e-2, 1e-6
 # A length of a step by which anything may be divided, in single precision too.
 SHORTEST = 1e-30
 # Time or index of the last step before the first one, where something is read at time zero.
 NO_STEP = -1.0
 ABOUT = (
-    "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
+    "Perturbation filter and feedback. The control returned is held until the next call, so it is the mean of the "
+    "nominal control over the coming step, taken to be as long as the last one, u_mean - C y. Before the first step no "
+    "length is known and it is the nominal control of time zero; where steps differ in length the control is early or "
+    "late by half of their difference: the estimate knows it, and the feedback acts on it. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
     "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h. The "
     "measurement m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, "
     "a' = h(x, u) + M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A "
     "the covariance of the error of a (U h of noise in it), B that between it and the estimate's: from E(s) of the "
-    "design, P becomes Phi P Phi' + d Q in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The "
-    "control is u - C y.",
-    "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
+    "design by P' = F P + P F' + Q. To first order L is h P M' (h M P M' + U)^-1.",
+    "A row of the measurement that is not finite is left out, and what is known without it is kept for the next steps; "
+    "readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
 ABOUT_INSTANTS = (
@@ -130,17 +142,19 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
 class Given(NamedTuple):
     """What a step begins with: the fields of the struct that it goes on from, and what is measured.
 
-    estimate; last: time of the last step (`NO_STEP`: there was none), or of the node that this one has come to; held:
+    estimate; length: of the last step, negative within a step that has come over the end of a phase: what of it lay
+    before; last: time of the last step (`NO_STEP`: there was none), or of the node that this one has come to; held:
     control since then; measured; elapsed: how long this step has been under way already; expected: integral of what is
     to be measured in that time; spread: half-vector of the covariance of the errors of estimate and integral at `last`,
     which counts in the place of E of the design where a step is under way or something is overdue; overdue: 1 where a
-    reading that was due at an instant did not come.
+    row that was due did not come.
     """
 
     estimate: Any
     last: Any
     held: Any
     measured: Any
+    length: Any
     elapsed: Any
     expected: Any
     spread: Any
@@ -148,10 +162,10 @@ class Given(NamedTuple):
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> Given:
-        """Of inputs by name; nothing is overdue where nothing is read at instants, nor expected where all is."""
+        """Of inputs by name; nothing is expected where all is read at instants."""
         estimate, last, held, measured = (values[name] for name in ("estimate", "last", "held", "measurement"))
-        expected, overdue = values.get("expected", ca.MX(0, 1)), values.get("overdue", ca.MX(0))
-        kept = values["elapsed"], expected, values["spread"], overdue
+        expected = values.get("expected", ca.MX(0, 1))
+        kept = values["length"], values["elapsed"], expected, values["spread"], values["overdue"]
         return Given(estimate, last, held, measured, *kept)
 
 
@@ -177,7 +191,7 @@ def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Ex
         valid: where it is zero nothing is predicted, counted and fed back.
     """
     m = design.sizes[1]
-    piece = next_piece(tables, ca.fmax(given.last, 0.0), time, valid)
+    piece = next_piece(design, tables, ca.fmax(given.last, 0.0), time, valid)
     begun = Ahead(given.estimate, given.expected, _known(design, tables, given, piece))
     ahead = predicted(design, tables, begun, given.held, piece)
     # a prediction that overflows is not gone on with: the step ends with the nominal control of its time
@@ -192,7 +206,10 @@ def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Ex
     feedback = found.C @ found.y
     good = finite(found.y, feedback)
     nominal = now.u[:m]
-    moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
+    gone = ca.fmax(-given.length, 0.0) + elapsed
+    length = ca.if_else(ca.logic_or(more, gone <= 0.0), given.length, gone)
+    coming = tables.mean_control(end, ca.fmin(end + length, tables.duration))[:m]
+    moved = ca.if_else(valid, coming, nominal) - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
     fields = {
         "time": ca.if_else(valid, end, given.last),
         "estimate": ca.if_else(more, ahead.estimate, ca.if_else(good, found.y, given.estimate)),
@@ -201,13 +218,13 @@ def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Ex
         "nominal_control": nominal,
         "feedback_gain": found.C,
         "filter_gain": found.L,
+        "length": length,
         "elapsed": ca.if_else(more, elapsed, 0.0),
         "spread": ca.if_else(valid, ca.if_else(more, pack_symbolic(ahead.spread), found.spread), given.spread),
     }
     if design.always:
         fields["expected"] = ca.if_else(more, ahead.expected, 0.0)
-    if design.reads:
-        fields["overdue"] = ca.if_else(valid, _overdue(design, tables, given, (piece, more, end), found), given.overdue)
+    fields["overdue"] = ca.if_else(ca.logic_and(valid, ca.logic_not(more)), found.apart, given.overdue)
     return Stepped(fields=fields, more=more, good=good, missing=found.missing)
 
 
@@ -216,7 +233,7 @@ def _known(design: Design, tables: History, given: Given, piece: Piece) -> Any:
     known = design.error(tables.at(piece.begin).e)
     if design.reads_first:  # the tables have what is known after it
         known = ca.if_else(given.last < 0.0, ca.DM(design.prior), known)
-    own = ca.logic_or(given.elapsed > 0.0, given.overdue) if design.reads else given.elapsed > 0.0
+    own = ca.logic_or(given.elapsed > 0.0, given.overdue)
     n, a = design.sizes[0], design.always
     return ca.if_else(own, unpack_symbolic(given.spread, n + a), ca.diagcat(known, ca.MX.zeros(a, a)))
 
@@ -235,12 +252,8 @@ def finite(*values: Expr) -> Any:
 def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
     (n, m, r), a = design.sizes, design.always
-    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1}
-    sizes |= {
-        "spread": half_length(n + a),
-        **({"expected": a} if a else {}),
-        **({"overdue": 1} if design.reads else {}),
-    }
+    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "length": 1}
+    sizes |= {"elapsed": 1, "spread": half_length(n + a), **({"expected": a} if a else {}), "overdue": 1}
     ports = {name: Port(name=name, rows=rows) for name, rows in sizes.items()}
     ports["measurement"] = measurement_port(design)
     ports["time"] = Port(name="time", unit="s", about="of the measurement")
@@ -259,7 +272,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     shapes = {"feedback_gain": (m, n), "filter_gain": (n, r), "estimate": (n, 1), "nominal_state": (st.nx, 1)}
     shapes |= {"control": (m, 1), "nominal_control": (m, 1), "expected": (design.always, 1)}
     shapes |= {"spread": (half_length(n + design.always), 1)}
-    units = {"time": "s", "elapsed": "s"}
+    units = {"time": "s", "length": "s", "elapsed": "s"}
     about = {
         "time": "of the last step",
         "estimate": "of the deviation of the state (and of unknown constants) from the nominal",
@@ -298,9 +311,16 @@ def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def first_fields(
-    design: Design, tables: History, fields: dict[str, Any], last: str, gain: Array | None = None
+    design: Design,
+    tables: History,
+    fields: dict[str, Any],
+    last: str,
+    gain: Array | None = None,
+    control: Array | None = None,
 ) -> Array:
     """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits.
+
+    Where the coming step is known the first control is another one, (m,).
 
     Where something is read at time zero the field `last`, that of the last step, says that there was none. The gain is
     that of the design, where another one is flown (m, n) that one.
@@ -309,7 +329,7 @@ def first_fields(
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
     x, u, e = (values[0] for values in tables.rows(np.zeros(1)))
     zeros |= {
-        "control": np.clip(u[:m], *design.limits),
+        "control": np.clip(u[:m] if control is None else control, *design.limits),
         "nominal_control": u[:m],
         "nominal_state": x,
     }
@@ -325,29 +345,9 @@ def solved_in_units(spread: Expr, right: Expr) -> Any:
     return units @ solved(units @ spread @ units, units @ right)
 
 
-def _overdue(design: Design, tables: History, given: Given, until: tuple[Piece, Any, Any], found: _Corrected) -> Any:
-    """Whether P is another than the design expects, as something that is read at an instant did not come, 1 or 0.
-
-    Args:
-        design: the model.
-        tables: the nominal.
-        given: what the step begins with.
-        until: the piece, whether the step goes on after it, where it is [s].
-        found: what the measurement told.
-    """
-    piece, more, end = until
-    slack = tables.margin * tables.duration
-    # before the first step something that is read at time zero is still to come
-    missed = design.passed(
-        ca.if_else(given.last < 0.0, given.last, piece.begin + slack), ca.if_else(more, end + slack, end - slack)
-    )
-    late = ca.logic_or(missed, ca.if_else(more, 0.0, found.late))
-    return ca.if_else(late, 1.0, ca.if_else(ca.logic_and(found.came, ca.logic_not(more)), 0.0, given.overdue))
-
-
 class _Corrected(NamedTuple):
-    """Estimate after the measurement, feedback gain, filter gain, half-vector of P after it, whether a row is missing;
-    whether one of those that are due at an instant is, and whether all of these came.
+    """Estimate after the measurement, feedback gain, filter gain, half-vector of P after it, whether a row is missing,
+    whether P is another than the design expects.
     """
 
     y: Any
@@ -355,8 +355,7 @@ class _Corrected(NamedTuple):
     L: Any
     spread: Any
     missing: Any
-    late: Any
-    came: Any
+    apart: Any
 
 
 def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nominal, time: Expr) -> _Corrected:
@@ -375,11 +374,11 @@ def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nomina
     seen, due = kind.sym("a", always), kind.sym("due", r)
     x, u, e, t = kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("e", st.ne), kind.sym("t")
     model = design.model(x, u, t)
-    E, C = kind.sym("E", n + always, n + always), design.gain(x, u, e, t)[0]
+    E, (C, designed) = kind.sym("E", n + always, n + always), design.gain(x, u, e, t)
     if r == 0:  # a phase that measures nothing: prediction alone, which the feedback goes on acting on
         gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C)])
         C, none = gain(now.x, now.u, now.e, time), ca.MX(0)
-        return _Corrected(ahead.estimate, C, ca.MX(n, 0), pack_symbolic(ahead.spread), none, none, none)
+        return _Corrected(ahead.estimate, C, ca.MX(n, 0), pack_symbolic(ahead.spread), none, none)
     present, read = ca.fabs(measured) <= LARGEST, slice(always, r)
     some = ca.fmax(h, SHORTEST)
     at_end = model.h[read, 0] + model.M[read, :] @ y + model.H[read, :] @ (held - u[:m])
@@ -392,13 +391,11 @@ def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nomina
     noise = ca.diagcat(kind(always, always), model.U[read, read])
     spread = rows @ E @ rows.T + ca.diag(there) @ noise @ ca.diag(there) + ca.diag(1 - there)
     L = solved_in_units(spread, rows @ E[:, :n]).T @ ca.diag(there)
-    after = E[:n, :n]  # what is not read at instants is what the design expects: the next step begins with its E
-    if design.reads:
-        left = ca.horzcat(ca.DM.eye(n), kind(n, always)) - L @ rows
-        after = left @ E @ left.T + L @ noise @ L.T
+    left = ca.horzcat(ca.DM.eye(n), kind(n, always)) - L @ rows
+    after = left @ E @ left.T + L @ noise @ L.T
     absent = due * (1 - present)
-    late = ca.sum1(absent[always:]) > 0
-    flags = [ca.sum1(absent) > 0, late, ca.logic_and(ca.sum1(due[always:]) > 0, ca.logic_not(late))]
+    apart = ca.fabs(ca.diag(after - designed)) > NEAR * ca.diag(designed) + SLIGHT * ca.DM(design.units) ** 2
+    flags = [ca.sum1(absent) > 0, ca.sum1(apart) > 0]
     kept = pack_symbolic(ca.diagcat(after, kind(always, always)))
     L = L @ ca.diag(roots)
     outputs = [ca.densify(v) for v in (y + L @ residual, C, L, kept, *flags)]
@@ -433,13 +430,13 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
         last[first] = NO_STEP
         time[first & (random.uniform(size=count) < 0.5)] = 0.0
     elapsed = (random.uniform(size=count) < 0.2) * steps
+    rows[:, span(ports, "length")] = ((random.uniform(size=count) < 0.8) * random.permutation(steps))[:, None]
     rows[:, span(ports, "elapsed")] = elapsed[:, None]
     kept, seen = _under_way(design, model, E, rows[:, span(ports, "estimate")], elapsed)
     rows[:, span(ports, "spread")] = kept * random.uniform(0.5, 2.0, (count, 1))
     if design.always:
         rows[:, span(ports, "expected")] = seen
-    if design.reads:
-        rows[:, span(ports, "overdue")] = random.uniform(size=(count, 1)) < 0.2
+    rows[:, span(ports, "overdue")] = random.uniform(size=(count, 1)) < 0.2
     rows[:, span(ports, "last")] = last[:, None]
     rows[:, span(ports, "time")] = time[:, None]
     for k, wrong in zip(range(count // 3, count), (np.nan, np.inf, -np.inf, 1e200, np.nan, 1e29), strict=False):

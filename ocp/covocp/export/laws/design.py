@@ -97,11 +97,6 @@ class Design:
         ]
         return ca.vertcat(ca.MX(0, 1), *rows)
 
-    def passed(self, begin: Expr, end: Expr) -> Any:
-        """Whether something is read after one time and before another; an MX expression."""
-        times = ca.DM(np.concatenate([own for own in self.instants if own is not None]))
-        return ca.mmax(ca.logic_and(times > begin, times < end))
-
     __repr__ = short_repr
 
     def model(self, x: Expr, u: Expr, t: Expr) -> DesignAt:

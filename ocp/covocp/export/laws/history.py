@@ -95,9 +95,13 @@ class History:
         """A time made safe; one that is not finite becomes `fallback`."""
         return clock(time, self.duration, self.margin, fallback)
 
+    def interval(self, time: Expr) -> Any:
+        """Number of the interval of the mesh that a time before the end is in; an MX expression."""
+        return _piece(self.nodes, time)
+
     def node_after(self, time: Expr) -> Any:
         """The first node after a time before the end, the end where there is none; an MX expression."""
-        return ca.MX(ca.DM(self.nodes))[_piece(self.nodes, time) + 1]
+        return ca.MX(ca.DM(self.nodes))[self.interval(time) + 1]
 
     def at(self, time: Expr) -> Nominal:
         """The nominal at a time within [0, T], an MX expression."""
@@ -114,17 +118,34 @@ class History:
         if not np.array_equal(self.z[-1], self.ends[-1]):
             z = ca.if_else(time >= self.duration, ca.DM(self.z[-1]), z)
         if not np.array_equal(self.knots, self.nodes):
-            k, nodes = _piece(self.nodes, time), ca.MX(ca.DM(self.nodes))
-            start, end = nodes[k], nodes[k + 1]
-        u = _column(self.u, k)
-        if self.u.shape[0] == self.nodes.size:
-            jumps = not np.array_equal(self.u[1:], self.u_ends)
-            after = _column(self.u_ends, k) if jumps else _column(self.u, k + 1)
-            u = _linear(self.u.shape[1])(u, after, start, end, time)
+            k = _piece(self.nodes, time)
+        u = _control(self, k, time)
         x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
         for own in self.units:  # interpolation keeps their length up to its error
             x[own] = x[own] / ca.norm_2(x[own])
         return Nominal(x=x, u=u, e=e)
+
+    def mean_control(self, begin: Expr, end: Expr) -> Any:
+        """The mean of the control between two times within [0, T], (nu,), that at `begin` where no time lies between.
+
+        Exact for controls that are constant or linear in each interval: to the value halfway within the first one comes
+        what the control differs from it later, over whole intervals from a table of integrals, about the mean of all.
+        """
+        first, last = _piece(self.nodes, begin), _piece(self.nodes, ca.fmax(begin, end))
+        nodes, lengths = ca.MX(ca.DM(self.nodes)), np.diff(self.nodes)[:, None]
+        starts, ends = self.u[: lengths.size], self.u_ends
+        parts = lengths / 2 * (starts + ends)
+        mean = parts.sum(axis=0, keepdims=True) / lengths.sum()
+        integrals = np.vstack([0.0 * mean, np.cumsum(parts - lengths * mean, axis=0)])
+        split = last > first
+        until = ca.if_else(split, nodes[first + 1], ca.fmax(begin, end))
+        halfway = _control(self, first, (begin + until) / 2)
+        since = nodes[last]
+        rest = _control(self, last, (since + end) / 2)
+        between = _column(integrals, last) - _column(integrals, first + 1)
+        between += (since - nodes[first + 1]) * (ca.DM(mean.T) - halfway)
+        more = (between + (end - since) * (rest - halfway)) / ca.if_else(split, end - begin, 1.0)
+        return halfway + ca.if_else(split, more, 0.0)
 
     def rows(self, t: Array) -> tuple[Array, Array, Array]:
         """x, u, e at some times, a row for each."""
@@ -240,6 +261,17 @@ def _resolved(knots: Array, pieces: tuple[Array, ...], least: float) -> tuple[Ar
     chords = (ends - starts) / np.diff(knots[chosen])[:, None]
     first[merged] = last[merged] = chords[merged]
     return knots[chosen], starts, ends, first, last
+
+
+def _control(tables: History, k: Expr, time: Expr) -> Any:
+    """The control at a time in interval k of the mesh."""
+    u = _column(tables.u, k)
+    if tables.u.shape[0] != tables.nodes.size:
+        return u
+    jumps = not np.array_equal(tables.u[1:], tables.u_ends)
+    after = _column(tables.u_ends, k) if jumps else _column(tables.u, k + 1)
+    nodes = ca.MX(ca.DM(tables.nodes))
+    return _linear(tables.u.shape[1])(u, after, nodes[k], nodes[k + 1], time)
 
 
 def _column(table: Array, k: Expr) -> Any:

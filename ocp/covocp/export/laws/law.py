@@ -39,6 +39,9 @@ STATUSES = {
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
     "COARSE": "the conditions hold, but the mesh of the export is too coarse for so much uncertainty at the start: its "
     "cost is off by more than about 1 %; export the solver for such a start",
+    "SAMPLES_SKIPPED": "samples before this one were left out: they are predicted over, but the measurement is weighed "
+    "by the gain of one period; the estimate is less certain than the design says until steps are of one period again",
+    "READING_IGNORED": "another call at the sample of the last one: its reading is not used",
 }
 CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the

@@ -12,9 +12,12 @@ from covocp.base.quadrature import GAUSS_NODES, gauss_transition, lyapunov_after
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
+from covocp.export.laws.paces import divided, paces
 
 # Times that differ by less than this share of a period are the same.
 WHOLE = 1e-9
+# No period is divided into pieces that are a smaller share of it.
+LEAST = 1e-6
 
 
 class Period(NamedTuple):
@@ -55,7 +58,7 @@ class Moves:
         inside = tables.nodes[(tables.nodes > t[0]) & (tables.nodes < t[-1])]
         grid = np.unique(np.concatenate([t, inside]))
         near = np.diff(grid, prepend=-np.inf) <= WHOLE * np.median(np.diff(t))
-        grid = np.array([*grid[~near]])
+        grid = divided(paces(design, tables), tables, grid[~near], LEAST * float(np.median(np.diff(t))))
         h = np.diff(grid)
         points = [_Point.at(design, tables, grid[:-1] + c * h, h[:, None, None]) for c in GAUSS_NODES]
         n, m, _ = design.sizes

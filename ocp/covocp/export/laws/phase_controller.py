@@ -106,11 +106,12 @@ class _Room:
         shapes |= {
             "feedback_gain": (m, n),
             "filter_gain": (n, self.r),
+            "length": (1, 1),
             "elapsed": (1, 1),
             "spread": (half_length(self.joint), 1),
         }
         shapes |= {"expected": (self.always, 1)} if self.always else {}
-        return shapes | ({"overdue": (1, 1)} if self.reads else {})
+        return shapes | {"overdue": (1, 1)}
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -298,7 +299,7 @@ def _given(leg: Leg, room: _Room) -> tuple[list[Any], Given]:
 
 
 def _fields(leg: Leg, room: _Room, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a phase with room; nothing is overdue where nothing is read at instants."""
+    """Fields of a phase with room."""
     return {name: flat(_padded(found.get(name, ca.MX(0)), *room.shapes[name])) for name in room.fields}
 
 
@@ -330,10 +331,11 @@ def _crossing(legs: tuple[Leg, ...], begins: ca.Function, room: _Room, k: int) -
     control = ca.MX(ca.DM(later.begun))
     for row, own in leg.kept:
         control[row] = given.held[own]
-    entered = {"estimate": ca.DM(leg.tangent) @ found.fields["estimate"], "control": control}
+    gone = found.fields["length"]
+    entered = {"estimate": ca.DM(leg.tangent) @ found.fields["estimate"], "control": control, "length": gone}
     start = {name: _padded(entered.get(HELD[name], ca.MX(0)), size) for name, size in room.kept.items()}
     ready = dict(zip(room.fields, begins(*start.values(), 0.0, np.nan, 0.0, 1.0)[1:-3], strict=True))
-    on = {**ready, **_fields(later, room, entered)}  # goes on from there
+    on = {**ready, **_fields(later, room, {**entered, "length": -gone})}  # goes on from there
     within, more = _fields(leg, room, found.fields), found.more
     fields = [ca.if_else(more, within[f], ca.if_else(meets, ready[f], on[f])) for f in room.fields]
     time = ca.if_else(more, leg.start + found.fields["time"], later.start)
@@ -400,7 +402,7 @@ def _outputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
     }
     fields = []
     for name, (rows, columns) in room.shapes.items():
-        (words, entries), unit = about[name], "s" if name == "elapsed" else ""
+        (words, entries), unit = about[name], "s" if name in ("length", "elapsed") else ""
         whole = name == "overdue"
         port = Port(name=name, rows=rows, columns=columns, about=words, entries=entries, unit=unit, whole=whole)
         fields.append(port)

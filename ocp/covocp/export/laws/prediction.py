@@ -2,8 +2,9 @@
 
 At its nodes the control of the nominal jumps or has a kink, and with it the slopes along the nominal may: a rule of
 integration that has two points in a step does not see that. So a step ends at the next node where one lies before its
-end, and goes on from there. What is predicted to a node is kept until the step is done: the estimate, the integral of
-what is to be measured, the covariance of the errors of both, and the time that has gone.
+end, and goes on from there; and before it where modes are faster than that (`paces`). What is predicted to a node is
+kept until the step is done: the estimate, the integral of what is to be measured, the covariance of the errors of both,
+and the time that has gone.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import casadi as ca
 
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
-from covocp.base.quadrature import GAUSS_NODES, gauss_stages
+from covocp.base.quadrature import GAP, GAUSS_NODES, gauss_stages
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
+from covocp.export.laws.paces import first_share, paces
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8
@@ -33,12 +35,13 @@ class Piece(NamedTuple):
     more: Any
 
 
-def next_piece(tables: History, begin: Expr, time: Expr, valid: Expr) -> Piece:
-    """The part of a step up to the next node of the mesh, or to its end.
+def next_piece(design: Design, tables: History, begin: Expr, time: Expr, valid: Expr) -> Piece:
+    """The part of a step up to the next node of the mesh, or to its end; a share of it where modes are fast.
 
     A node that is as near to one of its ends as the clock may be wrong counts as that end.
 
     Args:
+        design: the model.
         tables: the nominal.
         begin: where it begins [s].
         time: where the step ends [s].
@@ -48,6 +51,10 @@ def next_piece(tables: History, begin: Expr, time: Expr, valid: Expr) -> Piece:
     node = tables.node_after(begin + slack)
     more = ca.if_else(valid, node < time - slack, 0.0)
     end = ca.if_else(more, node, time)
+    own = paces(design, tables)
+    if own.matter:
+        part = first_share(own.at(tables.interval(begin + slack)), end - begin, 2.0 * slack)
+        more, end = ca.if_else(valid, ca.logic_or(more, part < 1.0), 0.0), begin + part * (end - begin)
     return Piece(begin=begin, end=end, length=ca.if_else(valid, end - begin, 0.0), more=more)
 
 
@@ -66,6 +73,10 @@ class Ahead(NamedTuple):
 def predicted(design: Design, tables: History, ahead: Ahead, held: Expr, piece: Piece) -> Ahead:
     """What a piece makes of it, computed in units of typical deviations.
 
+    The covariance is that of the Gauss method for P' = A P + P A' + diag(Q, U), A of deviation and integral:
+    transitions from the start, and from the two nodes, where the noise enters. It is semidefinite at any length, and
+    keeps what is stationary.
+
     Args:
         design: the model.
         tables: the nominal.
@@ -83,17 +94,26 @@ def predicted(design: Design, tables: History, ahead: Ahead, held: Expr, piece: 
     moved = [du - three[1][:m] for three in symbols]
     points = [dt * (inverse @ at.F @ units) for at in models]
     forcing = [dt * (inverse @ (at.G @ by)) for at, by in zip(models, moved, strict=True)]
-    (*values, change), (*moves, turn) = gauss_stages(points, forcing, inverse @ own, ca.DM.eye(n), solved)
+    # beside y, from rest, what a unit value of h f at the second node alone makes
+    begun = ca.horzcat(inverse @ own, kind(n, n))
+    forcing = [ca.horzcat(forcing[0], kind(n, n)), ca.horzcat(forcing[1], ca.DM.eye(n))]
+    (*values, change), (*moves, turn) = gauss_stages(points, forcing, begun, ca.DM.eye(n), solved)
+    late = [value[:, 1:] for value in (*values, change)]
+    early = [response + GAP * move for response, move in zip(late, (*moves, turn), strict=True)]
     rows = [at.M[:a, :] for at in models]
     means = [
-        at.h[:a, 0] + M @ (units @ y) + at.H[:a, :] @ by
+        at.h[:a, 0] + M @ (units @ y[:, 0]) + at.H[:a, :] @ by
         for at, M, y, by in zip(models, rows, values, moved, strict=True)
     ]
     slope = dt / 2 * sum((M @ units @ move for M, move in zip(rows, moves, strict=True)), kind(a, n))
     transition = ca.blockcat(ca.DM.eye(n) + units @ turn @ inverse, kind(n, a), slope @ inverse, ca.DM.eye(a))
-    noise = _noise_of_piece(design.noise(*symbols[1]), rows, [at.U[:a, :a] for at in models], dt)
+    noise = ca.diagcat(kind(n, n), dt / 2 * sum((at.U[:a, :a] for at in models), kind(a, a)))
+    for (*inside, after), point in zip((early, late), symbols, strict=True):
+        seen_of_it = dt / 2 * sum((M @ units @ value for M, value in zip(rows, inside, strict=True)), kind(a, n))
+        response = ca.vertcat(units @ after, seen_of_it) @ inverse
+        noise += 2 * dt * (response @ design.noise(*point) @ response.T)
     outputs = [
-        own + units @ change,
+        own + units @ change[:, 0],
         seen + dt / 2 * (means[0] + means[1]),
         transition @ error @ transition.T + noise,
     ]
@@ -102,21 +122,6 @@ def predicted(design: Design, tables: History, ahead: Ahead, held: Expr, piece: 
     at = [piece.begin + c * h for c in GAUSS_NODES]
     nodes = [(now.x, now.u, t) for now, t in zip(map(tables.at, at), at, strict=True)]
     return Ahead(*function(*ahead, held, h, *nodes[0], *nodes[1]))
-
-
-def _noise_of_piece(Q: Any, rows: list[Any], densities: list[Any], h: Any) -> Any:
-    """Covariance of what noise makes of deviation and integral in a piece: it comes evenly, the deviation keeps it.
-
-    Args:
-        Q: density of the process noise (n, n).
-        rows: M at both nodes, (a, n) each.
-        densities: U there, (a, a) each.
-        h: length of the piece.
-    """
-    M = (rows[0] + rows[1]) / 2
-    across = h**2 / 2 * (M @ Q)
-    own = h**3 / 3 * (M @ Q @ M.T) + h / 2 * (densities[0] + densities[1])
-    return ca.blockcat(h * Q, across.T, across, own)
 
 
 def solved(matrix: Expr, right: Expr) -> Any:

@@ -3,9 +3,10 @@
 For the samples t_k = k period, with y the estimate of the deviation and w the control held since the last sample,
 
     y-_k = Phi_k y_(k-1) + Gamma_k w + g_k,          g_k = - int Phi G u dt: the nominal goes on, the control is held
-    y_k  = y-_k + L_k (m_k - h_k - M_k y_(k-1) - H_k w),           u_k  =  u(t_k) - C(t_k) y_k,
+    y_k  = y-_k + L_k (m_k - h_k - M_k y_(k-1) - H_k w),           u_k  =  mean of u - C(t_k) y_k,
 
-the control within the limits, where there are some.
+the mean over the period that comes, the control within the limits, where there are some. Held at its value at t_k the
+nominal control would be half a period behind.
 
 The measurement m_k is the mean over the period before, and h_k + M_k y_(k-1) + H_k w the mean that is expected: of h(x,
 u) + M y- + H (w - u) along the nominal, y- as it moves in the period. What is read at an instant is expected there.
@@ -52,21 +53,24 @@ from covocp.export.laws.law import LARGEST, Law, Port, flat, span, stacked_size,
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.moves import WHOLE, Moves, Period
 from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, solved
-from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
+from covocp.export.laws.sampled_gain import flown_covariances, flown_means, sampled_gains
 
 MOST_SAMPLES = 200_000
 # Share of a period by which an instant may miss a sample.
 SAME_INSTANT = 1e-6
+OWN_STATUSES = (*STATUSES, "SAMPLES_SKIPPED", "READING_IGNORED")
 HELD = {"estimate": "estimate", "last": "index", "held": "control", "expected": "expected", "passed": "passed"}
 ABOUT = (
     "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the "
-    "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held "
-    "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
-    "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
-    "period; the control is u - C y. The measurement m is the mean of what is measured since the last call, and is "
-    "compared with the mean that is expected.",
+    "nearest sample; samples that were left out are predicted over, one loop for each, and the status says so, as the "
+    "gain is that of one period. The control returned is held until the next call, so it is the mean of the nominal "
+    "control over the coming period, u_mean - C y. The estimate y of the deviation from the nominal is predicted by "
+    "Phi y + Gamma u_held + g and corrected by L (m - what is expected), L of the discrete filter whose measurements "
+    "have the noise of one period. The measurement m is the mean of what is measured since the last call, and is "
+    "compared with the mean that is expected up to the sample: a call that is late by d is told h' d more than that, "
+    "and takes it for a deviation.",
     "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then "
-    "the gain of the other rows in the filter with all of them. At time zero the control is that of the nominal.",
+    "the gain of the other rows in the filter with all of them. At time zero the control is the mean of the nominal.",
 )
 ABOUT_INSTANTS = (
     "Rows of the measurement that are read at instants are compared with what is expected then, and count with "
@@ -81,13 +85,15 @@ class Samples:
     """Tables, a row for each sample from 0 to K: nominal and gains there, transition from the sample before.
 
     parts: by name, (K + 1, rows, columns); period [s]; times: of the samples (K + 1,) [s]; flown: covariance of the
-    deviation from the nominal there, as the loop flies with these gains, (K + 1, n, n).
+    deviation from the nominal there, as the loop flies with these gains, (K + 1, n, n); lag: its mean, which comes from
+    holding the control, (K + 1, n).
     """
 
     parts: dict[str, Array]
     period: float
     times: Array
     flown: Array
+    lag: Array
 
     __repr__ = short_repr
 
@@ -137,10 +143,13 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     feedback = at["C"] @ corrected
     good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
-    moved = at["u"] - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
+    moved = ca.if_else(valid, at["mean"], at["u"]) - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
+    again = ca.logic_and(begun > 0.0, wanted == begun)
+    ignored = ca.logic_and(again, ca.sum1(finite_rows[:always, 0]) > 0) if always else ca.MX(0)
     conditions = [
         *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
-        (missing, "MEASUREMENT_MISSING"),
+        (missing, "MEASUREMENT_MISSING"), (passed > 0.0 if always else ca.MX(0), "SAMPLES_SKIPPED"),
+        (ignored, "READING_IGNORED"),
     ]  # fmt: skip
     kept = ca.if_else(valid, index, begun)
     fields = {
@@ -171,9 +180,9 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         core=core,
         inputs=_ports(design),
         outputs=field_ports(design, fields),
-        statuses=STATUSES,
+        statuses=OWN_STATUSES,
         held={name: kept for name, kept in HELD.items() if kept in fields},
-        start=first_fields(design, tables, fields, "index", samples.parts["C"][0]),
+        start=first_fields(design, tables, fields, "index", samples.parts["C"][0], samples.parts["mean"][0, :, 0]),
         points=lambda random, count: _points(design, tables, samples, random, count),
         tolerance=tolerance,
     )
@@ -240,6 +249,10 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     L = np.array(gains)
     state, held, offset = (np.array([getattr(own, name) for own in periods]) for name in ("state", "held", "offset"))
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": offset[:, n:], "M": state[:, n:], "H": held[:, n:]}
+    ends = np.append(t[1:], tables.duration)
+    begins, until = ca.MX.sym("begins"), ca.MX.sym("until")
+    mean = ca.Function("mean", [begins, until], [tables.mean_control(begins, until)[:m]])
+    parts["mean"] = np.asarray(mean.map(t.size)(t[None, :], ends[None, :]).full()).T[:, :, None]
     parts |= {"C": C, "Phi": state[:, :n], "Gamma": held[:, :n], "g": offset[:, :n], "L": L}
     if design.always < r:
         parts["due"] = due
@@ -248,7 +261,8 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges is told by its numbers
         zero = periods[0]
         flown = flown_covariances(periods, design.prior, C, L, zero.state[n:], zero.noise[n:, n:])
-    return Samples(parts=parts, period=period, times=t, flown=flown)
+        lag = flown_means(periods, C, parts["mean"][:, :, 0], design.limits)
+    return Samples(parts=parts, period=period, times=t, flown=flown, lag=lag)
 
 
 def _due(design: Design, t: Array, period: float) -> Array:

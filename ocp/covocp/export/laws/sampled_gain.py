@@ -1,4 +1,4 @@
-"""Gains for samples of a fixed period, and the deviations of the loop that flies with them.
+"""Gains for samples of a fixed period, and the deviations of the loop that flies with them: spread and mean.
 
 The control is held between two samples: the best gain of that is not C(t) of the continuous loop, which overcorrects
 where it is large against 1/period, and may destabilise what it was made to hold.
@@ -66,4 +66,25 @@ def flown_covariances(
         joint = move @ joint @ move.T + enters @ period.noise @ enters.T
         joint = 0.5 * (joint + joint.T)
         result.append(joint[:n, :n])
+    return np.array(result)
+
+
+def flown_means(periods: list[Period], gains: Array, controls: Array, limits: tuple[Array, Array]) -> Array:
+    """Means of the deviation from the nominal at the samples: a control that is held is not the nominal one.
+
+    The estimate has the same mean: it knows what is held.
+
+    Args:
+        periods: what happens in each of them; the first entry counts for time zero.
+        gains: C_k, (K + 1, m, n). controls: what is handed out without feedback, (K + 1, m).
+        limits: lower and upper ones of the control, (m,) each.
+
+    Returns:
+        (K + 1, n).
+    """
+    n = gains.shape[2]
+    result = [np.zeros(n)]
+    for period, gain, control in zip(periods[1:], gains[:-1], controls[:-1], strict=True):
+        held = np.clip(control - gain @ result[-1], *limits)
+        result.append(period.state[:n] @ result[-1] + period.held[:n] @ held + period.offset[:n, 0])
     return np.array(result)

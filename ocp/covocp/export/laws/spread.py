@@ -13,6 +13,8 @@ from covocp.solution.solution import Solution
 # Factor between flown and predicted standard deviations above which nothing is exported, and is worth a warning.
 LARGEST_SPREAD = 1.5
 NOTICED = 1.05
+# Share of the predicted deviation by which the mean may be off the nominal: more makes its root mean square noticed.
+LARGEST_LAG = float(np.sqrt(NOTICED**2 - 1.0))
 # Share of its largest predicted deviation below which a deviation counts as that: where it passes through a minimum a
 # delay of half a period moves it much and costs nothing.
 SMALL = 0.1
@@ -43,6 +45,27 @@ def sampled_flight(solution: Solution, samples: Samples) -> Flight:
         end[0, rows, rows] = np.maximum(end[0, rows, rows], SMALL_AT_END**2 * variances.max(axis=0))
     at_end = compared(solution, *ends, samples.times[-1:])
     return max(along, at_end, key=lambda flight: flight.worst)
+
+
+def check_lag(solution: Solution, samples: Samples) -> None:
+    """Warn where the mean of the loop, its control held between samples, is off the nominal by more than it spreads."""
+    assert solution.loop is not None
+    nodes, X = solution.t, solution.loop.X
+    variances = np.diagonal(X, axis1=1, axis2=2)
+    after = np.clip(np.searchsorted(nodes, samples.times), 1, nodes.size - 1)
+    least = np.full(samples.times.shape, SMALL)
+    least[samples.times >= nodes[-1] * (1.0 - WHOLE)] = SMALL_AT_END
+    floor = least[:, None] ** 2 * variances.max(axis=0)
+    expected = np.sqrt(np.maximum(np.maximum(variances[after - 1], variances[after]), floor))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.nan_to_num(np.where(expected > 0.0, np.abs(samples.lag) / expected, 0.0), nan=np.inf)
+    k, row = np.unravel_index(int(np.argmax(share)), share.shape)
+    if share[k, row] > LARGEST_LAG:
+        warn_user(
+            f"With its control held over {samples.period:g} s the loop flies beside the nominal: the mean of "
+            f"'{solution.augmented[row]}' is off by {samples.lag[k, row]:.4g} at t = {samples.times[k]:.4g} s, where "
+            f"its standard deviation is {expected[k, row]:.4g} as predicted; a shorter period= halves it, or more."
+        )
 
 
 def check_flight(flight: Flight, largest: float, period: float | None) -> None:
