@@ -7,6 +7,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.extremal.mesh_error import node_error
@@ -214,3 +215,33 @@ def test_what_first_steps_would_take_for_nothing_is_seen_before_they_run(method)
     a, w, T = 0.1, 2 * np.pi * 20.0, DURATION
     shaken_alone = (a * np.sin(w * T) - w * np.cos(w * T) + w * np.exp(-a * T)) / (a**2 + w**2)
     assert found["x"][-1] == pytest.approx(flown(found, 20.0, amplitude=0.0) + shaken_alone, abs=1e-4)
+
+
+def best_cost(frequency):
+    """Of the lag shaken by a sine: its Hamiltonian equations are linear, and two runs of them meet p(T) = 0."""
+    steps = {"rtol": 1e-9, "atol": 1e-11, "max_step": 0.1 / frequency}
+
+    def rate(t, z):
+        x, p, _ = z
+        u = -p / 2
+        rest = u - 0.1 * x + np.sin(2 * np.pi * frequency * t)
+        return [rest, 0.1 * p - 0.2 * (x - 1), u**2 + 0.1 * (x - 1) ** 2]
+
+    def end(start):
+        return solve_ivp(rate, (0, DURATION), [0.0, start, 0.0], rtol=1e-9, atol=1e-11, max_step=0.1 / frequency).y[
+            :, -1
+        ]
+
+    missed = end(0.0)[1]
+    return end(-missed / (end(1.0)[1] - missed))[2]
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+@pytest.mark.parametrize("frequency", [5.0, 10.0])
+def test_a_sine_at_whose_zeros_the_steps_meet_it_is_no_magnitude(frequency, method):
+    ocp = co.Problem(DURATION)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u - 0.1 * x + ca.sin(2 * np.pi * frequency * ocp.time))
+    ocp.minimize(running=u**2 + 0.1 * (x - 1) ** 2)
+    found = co.solve(ocp, method=method, intervals=INTERVALS, progress=False)
+    assert found.cost == pytest.approx(best_cost(frequency), rel=2e-4)
