@@ -228,9 +228,7 @@ def best_cost(frequency):
         return [rest, 0.1 * p - 0.2 * (x - 1), u**2 + 0.1 * (x - 1) ** 2]
 
     def end(start):
-        return solve_ivp(rate, (0, DURATION), [0.0, start, 0.0], rtol=1e-9, atol=1e-11, max_step=0.1 / frequency).y[
-            :, -1
-        ]
+        return solve_ivp(rate, (0, DURATION), [0.0, start, 0.0], **steps).y[:, -1]
 
     missed = end(0.0)[1]
     return end(-missed / (end(1.0)[1] - missed))[2]
