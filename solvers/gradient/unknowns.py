@@ -145,9 +145,8 @@ class Unknowns(ABC):
         sizes = np.maximum(sizes, self.sizes_along(iterate, linear, ell))
         norm = np.sqrt(np.sum(inverse[chosen] * left[chosen] ** 2))
         size = np.sqrt(np.sum(inverse[chosen] * sizes**2))
-        bent = float(
-            self.extra @ self.unit[self.others] ** 2
-        )  # a cost that is zero at its best is no size of its slopes
+        # a cost that is zero at its best is no size of its slopes
+        bent = float(self.extra @ self.unit[self.others] ** 2)
         total = max(self.cost_size(iterate), VANISHING * bent, np.finfo(float).tiny)
         size = max(size, FAINT * total / np.sqrt(iterate.run.duration))  # where the best control is none
         slope = float(norm / size) if size > 0 else 0.0

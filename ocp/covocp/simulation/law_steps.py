@@ -66,7 +66,7 @@ class Lost:
 
     def ahead(self, rate: Callable[[Array, float], Array], h: float) -> Iterator[tuple[Array, float]]:
         """States on the way of the first one, without noise, at which its rate has no value."""
-        moved = h * rate(self.state, self.time)
+        moved = np.nan_to_num(h * rate(self.state, self.time), nan=0.0, posinf=0.0, neginf=0.0)
         for c in AHEAD:
             state, time = self.state + c * moved, self.time + min(c, 1.0) * h
             if not np.isfinite(rate(state, time)).all():

@@ -35,8 +35,8 @@ SHARE = 0.2
 WINDOW = 2.0
 # By how much the steps that just see everything are divided once more.
 MARGIN = 2
-# Steps of a run that an oscillation may ask for, at most: those that a filter may ask for (`step_choice`).
-MOST_STEPS = 100_000
+# Steps of a run that an oscillation may ask for, at most: 300 runs take some ten seconds.
+MOST_STEPS = 20_000
 # Share of its magnitude by which a state that is known exactly may be off by the steps (`verdict`), and of the largest
 # rate below which that of such a state is rounding.
 EXACT, ROUNDING = 1e-4, 1e-12
@@ -103,7 +103,7 @@ def turning(values: Array, least: Array | float = 0.0) -> NDArray[np.bool_]:
 
     Args:
         values: at the places in each step, (steps, places, rows); a step without a value there turns nothing.
-        least: change of each row in a step below which it is no turn, (rows,), beside what is little anyway.
+        least: amplitude of each row in a step below which it is no turn, (rows,), beside what is little anyway.
     """
     turned = np.zeros((values.shape[0], values.shape[2]), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -119,7 +119,7 @@ def turning(values: Array, least: Array | float = 0.0) -> NDArray[np.bool_]:
     for move in moves.swapaxes(0, 1):
         turns += move * last < 0
         last = np.where(move != 0, move, last)
-    turned[known] = (turns >= TURNS) & (change > np.maximum(little, least))
+    turned[known] = (turns >= TURNS) & (change > np.maximum(little, 2.0 * np.asarray(least)))
     return turned
 
 

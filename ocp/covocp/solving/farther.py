@@ -22,7 +22,14 @@ FEW = 3
 
 
 def in_larger_units(
-    ready: Callable[[], Prepared], prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess
+    ready: Callable[[], Prepared],
+    prepared: Prepared,
+    outcome: Outcome,
+    values: Array,
+    reporter: Progress,
+    start: Guess,
+    *,
+    first: bool,
 ) -> tuple[Outcome, Prepared]:
     """Where a run ended as soon as it began, or at a large cost, look whether this sees the units; else go far away.
 
@@ -33,12 +40,14 @@ def in_larger_units(
         values: of the parameters.
         reporter: of iterations.
         start: of the run.
+        first: whether none went before: of later ones those are looked at that made no step.
 
     Returns:
         The outcome, perhaps of another run, and what ran.
     """
     cost = cost_of(outcome)
-    suspicious = 0 <= outcome.stats.get("iterations", -1) <= FEW or abs(cost) > LARGE_COST
+    few = 0 <= outcome.stats.get("iterations", -1) <= (FEW if first else 0)
+    suspicious = few or abs(cost) > LARGE_COST
     passed = start.warm or reporter.stop or outcome.extremal.statement.coupled
     if passed or not outcome.converged or not suspicious:
         return outcome, prepared
@@ -47,6 +56,8 @@ def in_larger_units(
         return outcome, prepared
     larger = ready()
     again = larger.solve(values, Guess(trajectory=found), reporter)
+    if again.converged and cost_of(again) >= cost:
+        return outcome, prepared
     return with_stats(again, **counted(outcome, again)), larger
 
 

@@ -126,7 +126,7 @@ class Solver:
         self._options = self._laid_out()
         self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
-        self._looked = False  # at the steps along the guess
+        self._looked = self._ran = False  # at the steps along the guess; from a start
         self._borne: Beginning | None = None  # what the nodes are known to be graded for
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
@@ -284,9 +284,9 @@ class Solver:
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
-        outcome, prepared = in_larger_units(
-            lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start
-        )
+        given = (lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start)
+        outcome, prepared = in_larger_units(*given, first=not self._ran)
+        self._ran = True
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
@@ -369,8 +369,8 @@ class Solver:
         if self._looked or not self._own_steps:
             return
         self._looked = True
-        guess = own_start(self._solved, mesh, values).trajectory
         try:
+            guess = own_start(self._solved, mesh, values).trajectory
             finer = steps_along(self._solved, mesh, guess, values, self._options, OPTIMISED, fast_alone=not large)
         except RuntimeError:  # CasADi's, of a linear system that is singular there: the run tells
             return

@@ -25,6 +25,8 @@ SMALL_UNIT, LARGE_COST = 1e-4, 1e6
 # times the one before.
 SEEN = 1e-10
 STEPS, FURTHER = 20, 1e3
+# A cost that changes by less than this share of itself over a unit does not see it.
+UNSEEN = 1e-8
 # A size counts where it is so many times the unit.
 FAR = 1e2
 # Share of the cost by which a point far away must be less to be a better one, and what it may violate.
@@ -75,8 +77,11 @@ def noticed_units(run: Run, flat: Array, units: Array, untold: NDArray[np.bool_]
     with np.errstate(all="ignore"):
         cost = merit(run, flat)[0]
         for i in np.flatnonzero(untold).tolist() if np.isfinite(cost) else ():
-            size = abs(newton_step(_along(run, flat, i), cost, float(units[i])))
-            if size > FAR * units[i]:
+            cost_of, unit = _along(run, flat, i), float(units[i])
+            if max(abs(cost_of(side * unit) - cost) for side in (1.0, -1.0)) > UNSEEN * abs(cost):
+                continue  # a cost that sees the unit needs no other
+            size = abs(newton_step(cost_of, cost, unit))
+            if size > FAR * unit:
                 result[i] = size
     return result
 
@@ -106,6 +111,7 @@ def further(
         for k, unit in free.items():
             step = newton_step(_from(run, u, k), cost, unit)
             start[k] += step if abs(step) > FAR * unit else 0.0
+        moved = run.clip(moved)
         found = merit(_started(run, start), moved)
     if found[0] < cost - GAINED * abs(cost) and found[1] <= max(violation, MISSED):
         return Moved(u=moved, start=_started(run, start).start)
@@ -113,9 +119,9 @@ def further(
 
 
 def _along(run: Run, u: Array, i: int) -> Callable[[float], float]:
-    """The cost of controls of which one is changed by a constant."""
+    """The cost of controls of which one is changed by a constant, within its bounds."""
     constant = np.eye(u.shape[1])[i]
-    return lambda step: merit(run, u + step * constant)[0]
+    return lambda step: merit(run, run.clip(u + step * constant))[0]
 
 
 def _from(run: Run, u: Array, k: int) -> Callable[[float], float]:

@@ -62,10 +62,10 @@ def limit_units(lower: Array, upper: Array) -> Array:
 
 
 def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> Array:
-    """Units of the rows of conditions: those of their limits; where these are zero what the variables make of them.
+    """Units of the rows of conditions: those of their limits; where these are zero of what is beside the variables.
 
-    That is what a row varies by, to first order, if all variables change by their magnitudes: it counts where it is so
-    many times, `SILENT`, less or more than one.
+    That is what a row is where all variables are zero: E - 0.01 <= 0 is E <= 0.01. Where that is zero too it is what
+    the row varies by, to first order, if all variables change by their magnitudes, where this is below 1 / `SILENT`.
 
     Args:
         statement: the problem.
@@ -78,15 +78,17 @@ def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> A
     if not silent.any():
         return units
     sizes = scales.x, np.atleast_2d(scales.u).max(axis=0), scales.e
-    varied = np.zeros(silent.size)
+    beside, varied = np.zeros(silent.size), np.zeros(silent.size)
     with np.errstate(all="ignore"):
         for side in (1.0, 0.0, -1.0):
             at = [side * size for size in sizes]
-            time = 0.5 * (1.0 + side) * scales.duration
-            found = _variation(statement, conditions.function)(*at, time, scales.duration, statement.values, *sizes)
+            others = (0.5 * (1.0 + side) * scales.duration, scales.duration, statement.values)
+            found = _variation(statement, conditions.function)(*at, *others, *sizes)
             varied = np.fmax(varied, np.where(np.isfinite(own := np.asarray(found.full()).ravel()), own, 0.0))
-    far = silent & (varied > 0) & ((varied < 1.0 / SILENT) | (varied > SILENT))
-    return np.where(far, varied, units)
+            found = conditions.function(*(0.0 * size for size in sizes), *others)
+            beside = np.fmax(beside, np.where(np.isfinite(own := np.abs(found.full()).ravel()), own, 0.0))
+    units = np.where(silent & (beside > 0), limit_units(beside, beside), units)
+    return np.where(silent & (beside == 0) & (varied > 0) & (varied < 1.0 / SILENT), varied, units)
 
 
 @lru_cache(maxsize=KEPT)
