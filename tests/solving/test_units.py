@@ -151,3 +151,40 @@ def test_what_a_control_is_needed_for_is_measured_in_its_own_unit(unit, bound):
     still = Trajectory(x=np.zeros((21, 1)), u=np.zeros((21, 1)), e=np.zeros((21, 0)), duration=1.0)
     needed = needed_controls(st, mesh, still, np.ones(1), st.values)
     assert needed[0] / unit == pytest.approx(1.0, rel=1e-2)
+
+
+@pytest.mark.parametrize("written", ["beside zero", "beside a number"])
+@pytest.mark.parametrize("far", [1e4, 1e8])
+def test_a_limit_that_stands_beside_the_variables_holds_from_far_away(far, written):
+    """Brought from far to x <= 1 with v = 1: x - 1 <= 0 has the size of the number in it, not that of the start."""
+    ocp = co.Problem(10.0)
+    x, v, u = ocp.state("x", initial=far), ocp.state("v", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=u**2)
+    zero = written == "beside zero"
+    ocp.subject_to(x - 1.0 if zero else x, upper=0.0 if zero else 1.0, at="final")
+    ocp.subject_to(v - 1.0 if zero else v, equals=0.0 if zero else 1.0, at="final")
+    solution = solve(ocp, intervals=30)
+    missed = np.array([1.0 - far, 1.0])  # by the Gramian of two integrators
+    gramian = np.array([[1000.0 / 3, 50.0], [50.0, 10.0]])
+    assert solution.cost == pytest.approx(missed @ np.linalg.solve(gramian, missed), rel=1e-8)
+    assert solution["x"][-1] <= 1.0 + 1e-6
+
+
+@pytest.mark.parametrize("prior", [1e4, 1e8])
+def test_a_variance_that_stands_beside_its_limit_is_met_from_a_large_prior(prior):
+    costs = []
+    for beside in (0.0, 0.01):
+        ocp = co.Problem(10.0)
+        x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u")
+        b = ocp.unknown("b", mean=1.0, variance=prior)
+        ocp.dynamics(x, -x + b * u, noise=0.1)
+        ocp.measurement("y", x, noise=0.1)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=u**2)
+        ocp.subject_to(E[b, b] - beside, upper=0.01 - beside, at="final")
+        solution = solve(ocp, intervals=30)
+        assert solution.trajectory.e[-1, -1] <= 0.01 * (1 + 1e-5)
+        costs.append(solution.cost)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-5)
