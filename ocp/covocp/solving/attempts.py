@@ -40,15 +40,22 @@ def from_starts(
     """
     tried: list[tuple[Outcome, Guess]] = []
     refused: list[OutsideDomainError] = []
+    best: tuple[Outcome, Guess] | None = None
     for guess in islice(guesses, TRIED):
+        if best is not None and not guess.rival:
+            break
         try:
             outcome = prepared.solve(values, replace(guess, tentative=not guess.warm), reporter)
         except OutsideDomainError as error:
             refused.append(error)
             continue
         tried.append((outcome, guess))
-        if outcome.converged or not (outcome.stats.get("wandered") or guess.held) or reporter.stop:
+        if outcome.converged and guess.rival and not reporter.stop:
+            best = min(best or tried[-1], tried[-1], key=lambda one: cost_of(one[0]))
+        elif reporter.stop or not guess.rival and (outcome.converged or not _goes_on(outcome, guess)):
             break
+    if best is not None:
+        return _with_all(best[0], [one for one, _ in tried]), best[1]
     if not tried:
         raise refused[0]
     outcome, guess = tried[-1]
@@ -60,6 +67,20 @@ def from_starts(
     if len(tried) > 1:
         outcome = replace(outcome, stats={**outcome.stats, "tried": len(tried)})
     return outcome, guess
+
+
+def _goes_on(outcome: Outcome, guess: Guess) -> bool:
+    """Whether a run that failed says little of those from other starts."""
+    return bool(outcome.stats.get("wandered")) or guess.held
+
+
+def _with_all(best: Outcome, outcomes: list[Outcome]) -> Outcome:
+    """The best outcome with the iterations and times of all of them."""
+    stats = {**best.stats}
+    for name in ("iterations", "build_seconds", "solve_seconds"):
+        if name in stats and name != "build_seconds":
+            stats[name] = sum(one.stats.get(name, 0) for one in outcomes)
+    return replace(best, stats=stats if len(outcomes) == 1 else {**stats, "tried": len(outcomes)})
 
 
 def mention_left(error: OutsideDomainError) -> None:
