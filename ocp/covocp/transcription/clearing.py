@@ -15,7 +15,7 @@ from covocp.transcription.steering import Run
 # Weights of squared misses beside the energy, in units of what is due: of final values, of all else.
 FINAL, LIMITS = 1e5, 300.0
 # Linearisations, changes of what binds within one, shares of a step, the gain below which no other is worth while.
-STEPS, CHANGES, LENGTHS, LITTLE = 10, 20, (1.0, 0.5, 0.2, 0.05), 1e-3
+STEPS, CHANGES, LENGTHS, LITTLE = 10, 20, (1.0, 0.5, 0.2, 0.05), 3e-3
 # A push is done where this share of it is left at most.
 PUSHED = 0.1
 
@@ -69,12 +69,17 @@ def energy(run: Run, u: Array, flat: Array) -> float:
 
 
 def cleared(
-    along: Course, meant: NDArray[np.bool_], task: Clearing, push: Push | None = None
+    along: Course,
+    before: NDArray[np.bool_],
+    meant: NDArray[np.bool_],
+    task: Clearing,
+    push: Push | None = None,
 ) -> tuple[Course, NDArray[np.bool_]]:
     """A course pushed to one side, then brought where the conditions that are meant are met, with little energy.
 
     Args:
         along: where to begin.
+        before: what counts while it is pushed: what it is pushed out of would hold it back.
         meant: nodes and conditions that count, (K, rows); what is violated beside them is added to them.
         task: what else there is to meet.
         push: a side to which states must be moved first.
@@ -84,15 +89,16 @@ def cleared(
     """
     value = np.inf
     for _ in range(STEPS):
-        meant = _grown(meant, along.violated)
-        value = _merit(along, meant, task, push)
+        meant = _grown(meant, along.violated) if push is None else meant
+        counted = meant if push is None else before
+        value = _merit(along, counted, task, push)
         states, slopes = slopes_along(along)
         if not (np.isfinite(states).all() and np.isfinite(slopes).all()):
             return along, meant
-        change = _change(along, states, _rows(along, meant, task, push, states, slopes), task)
+        change = _change(along, states, _rows(along, counted, task, push, states, slopes), task)
         for length in LENGTHS:
             trial = course(along.run, along.run.clip(along.u + length * change.reshape(along.u.shape)))
-            if trial is not None and (reached := _merit(trial, meant, task, push)) < value:
+            if trial is not None and (reached := _merit(trial, counted, task, push)) < value:
                 break
         else:
             trial, reached = None, value

@@ -27,6 +27,8 @@ TRIES, KEPT = 40, 3
 LEFT = 0.05
 # Largest size of what is beyond a limit, as a share of the magnitude of the condition, where nothing was beyond it.
 FAINT = 0.01
+# Runs are one whose costs differ by less than the first, relative, and states by less than the second, in their scales.
+SAME, NEARBY = 5e-3, 0.03
 # Ways that cost up to so many times more are compared by the method, and where the duration is free.
 NEAR, NEAR_FREE = 0.15, 1.0
 
@@ -62,30 +64,36 @@ def detours(run: Run, fixed: tuple[int, ...], target: Array, flat: Array, roots:
     task = Clearing(fixed=fixed, target=target, flat=flat, sizes=np.ones(0), energy=1.0)
     queue: list[tuple[bool, float, int, Detour]] = []
     found: list[Detour] = []
-    made, pushed = 0, 0
-    for u in roots:
-        along = course(run, u)
-        if along is not None:
-            root = _detour(along, np.zeros(along.values.shape, dtype=bool), FAINT * along.magnitudes, task)
-            made += 1
-            heapq.heappush(queue, (*root.rank, made, root))
-    while queue and pushed < TRIES and len(found) < KEPT:
+    made = [root for u in roots if (root := _root(run, u, task)) is not None]
+    for k, root in enumerate(made):
+        heapq.heappush(queue, (*root.rank, k, root))
+    pushed = 0
+    while queue and len(found) < KEPT:
         best = heapq.heappop(queue)[-1]
         if not np.isfinite(best.cost):
             break
         place = _deepest(best)
         if place is None:
             found += [best] if not best.violation > LEFT and _is_new(best, found) else []
-            continue
-        sides = pushes(best.along, *place, fixed)
-        pushed += len(sides)
-        for child in _beside(best, *place, sides, task):
-            made += 1
-            heapq.heappush(queue, (*child.rank, made, child))
+        elif pushed < TRIES:
+            sides = pushes(best.along, *place, fixed)
+            pushed += len(sides)
+            for child in _beside(best, *place, sides, task):
+                if _is_new(child, made):
+                    made.append(child)
+                    heapq.heappush(queue, (*child.rank, len(made), child))
     if not pushed or not found:
         return []
     near = NEAR_FREE if run.statement.duration.free else NEAR
     return [one.along.u for one in found if one.cost <= found[0].cost + near * abs(found[0].cost)]
+
+
+def _root(run: Run, u: Array, task: Clearing) -> Detour | None:
+    """A run as it is; None where something along it has no value."""
+    along = course(run, u)
+    if along is None:
+        return None
+    return _detour(along, np.zeros(along.values.shape, dtype=bool), FAINT * along.magnitudes, task)
 
 
 def _detour(along: Course, meant: NDArray[np.bool_], sizes: Array, task: Clearing) -> Detour:
@@ -126,12 +134,13 @@ def _beside(
     for push in sides or [None]:
         unit = used + (push.depth**2 if push is not None else 0.0)
         own = in_sizes(task, sizes, unit if unit > 0 else 1.0)
-        following, counted = cleared(along, meant, own, push)
+        following, counted = cleared(along, detour.meant, meant, own, push)
         result.append(_detour(following, counted, sizes, task))
     return result
 
 
 def _is_new(detour: Detour, found: list[Detour]) -> bool:
-    """Whether no other way has about the same states."""
+    """Whether no other one has about the same states and the same cost."""
     scale = detour.along.run.divisors
-    return all(np.abs((detour.along.x - other.along.x) / scale).max() > LEFT for other in found)
+    alike = [other for other in found if abs(other.cost - detour.cost) <= SAME * abs(detour.cost)]
+    return all(np.abs((detour.along.x - other.along.x) / scale).max() > NEARBY for other in alike)
