@@ -30,7 +30,8 @@ def from_starts(
 
     A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
     all of them, the first run counts: it is made again, and not stopped, where it was stopped. Where a run fails from a
-    start that a feedback holds, there is another one that is left to itself.
+    start that a feedback holds, there is another one that is left to itself. Of rivals, which come first, the cheapest
+    outcome counts.
 
     Returns:
         The outcome, and the start from which it came.
@@ -52,7 +53,7 @@ def from_starts(
         tried.append((outcome, guess))
         if outcome.converged and guess.rival and not reporter.stop:
             best = min(best or tried[-1], tried[-1], key=lambda one: cost_of(one[0]))
-        elif reporter.stop or not guess.rival and (outcome.converged or not _goes_on(outcome, guess)):
+        elif reporter.stop or (not guess.rival and (outcome.converged or not _goes_on(outcome, guess))):
             break
     if best is not None:
         return _with_all(best[0], [one for one, _ in tried]), best[1]
@@ -75,12 +76,11 @@ def _goes_on(outcome: Outcome, guess: Guess) -> bool:
 
 
 def _with_all(best: Outcome, outcomes: list[Outcome]) -> Outcome:
-    """The best outcome with the iterations and times of all of them."""
-    stats = {**best.stats}
-    for name in ("iterations", "build_seconds", "solve_seconds"):
-        if name in stats and name != "build_seconds":
-            stats[name] = sum(one.stats.get(name, 0) for one in outcomes)
-    return replace(best, stats=stats if len(outcomes) == 1 else {**stats, "tried": len(outcomes)})
+    """The best outcome with the iterations and times of all runs."""
+    if len(outcomes) == 1:
+        return best
+    names = [name for name in ("iterations", "solve_seconds") if name in best.stats]
+    return with_stats(best, tried=len(outcomes), **{name: sum(one.stats[name] for one in outcomes) for name in names})
 
 
 def mention_left(error: OutsideDomainError) -> None:

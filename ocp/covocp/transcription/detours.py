@@ -27,8 +27,9 @@ TRIES, KEPT = 40, 3
 LEFT = 0.05
 # Largest size of what is beyond a limit, as a share of the magnitude of the condition, where nothing was beyond it.
 FAINT = 0.01
-# Runs are one whose costs differ by less than the first, relative, and states by less than the second, in their scales.
-SAME, NEARBY = 5e-3, 0.03
+# Runs are one whose costs differ by less than the first, relative, and states by less than the second, in their scales,
+# or the third in the end.
+SAME, NEARBY, KEPT_APART = 2e-3, 0.01, 0.05
 # Ways that cost up to so many times more are compared by the method, and where the duration is free.
 NEAR, NEAR_FREE = 0.15, 1.0
 
@@ -74,7 +75,7 @@ def detours(run: Run, fixed: tuple[int, ...], target: Array, flat: Array, roots:
             break
         place = _deepest(best)
         if place is None:
-            found += [best] if not best.violation > LEFT and _is_new(best, found) else []
+            found += [best] if not best.violation > LEFT and _is_new(best, found, KEPT_APART) else []
         elif pushed < TRIES:
             sides = pushes(best.along, *place, fixed)
             pushed += len(sides)
@@ -118,9 +119,7 @@ def _deepest(detour: Detour) -> tuple[int, NDArray[np.intp]] | None:
     return max(found, key=lambda one: float(depths[one[1], one[0]].max()))
 
 
-def _beside(
-    detour: Detour, row: int, nodes: NDArray[np.intp], sides: list[Push], task: Clearing
-) -> list[Detour]:
+def _beside(detour: Detour, row: int, nodes: NDArray[np.intp], sides: list[Push], task: Clearing) -> list[Detour]:
     """The run pushed to each side of a condition; only cleared of that condition where it has but one."""
     along, run = detour.along, detour.along.run
     sizes = detour.sizes.copy()
@@ -131,7 +130,8 @@ def _beside(
     meant[:, run.statement.path.size :] = True
     result: list[Detour] = []
     used = energy(run, along.u, task.flat)
-    for push in sides or [None]:
+    each: list[Push | None] = [*sides] or [None]
+    for push in each:
         unit = used + (push.depth**2 if push is not None else 0.0)
         own = in_sizes(task, sizes, unit if unit > 0 else 1.0)
         following, counted = cleared(along, detour.meant, meant, own, push)
@@ -139,8 +139,9 @@ def _beside(
     return result
 
 
-def _is_new(detour: Detour, found: list[Detour]) -> bool:
-    """Whether no other one has about the same states and the same cost."""
-    scale = detour.along.run.divisors
+def _is_new(detour: Detour, found: list[Detour], apart: float = NEARBY) -> bool:
+    """Whether no other one that was cleared of the same conditions has about the same states and the same cost."""
+    scale, rows = detour.along.run.divisors, detour.meant.any(axis=0)
     alike = [other for other in found if abs(other.cost - detour.cost) <= SAME * abs(detour.cost)]
-    return all(np.abs((detour.along.x - other.along.x) / scale).max() > NEARBY for other in alike)
+    alike = [other for other in alike if np.array_equal(other.meant.any(axis=0), rows)]
+    return all(np.abs((detour.along.x - other.along.x) / scale).max() > apart for other in alike)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -66,20 +67,23 @@ class Course:
         """Which conditions are not met at which nodes, (K, rows)."""
         return np.asarray(self.excess > MET * self.magnitudes)
 
-    def points(self, nodes: Array, x: Array) -> list[Array]:
+    def points(self, nodes: NDArray[np.intp], x: Array) -> list[Array]:
         """The arguments of the conditions for other states at some nodes, a column each."""
         at = at_nodes(self.u, self.x.shape[0])[nodes]
         times = self.run.mesh.nodes[nodes][None, :] * self.run.duration
         return [x.T, at.T, self.e[nodes].T, times, *repeated(self.run.duration, self.run.parameters, nodes.size)]
 
 
-def course(run: Run, u: Array) -> Course | None:
-    """The conditions along the run of some controls; None where something there has no value."""
+def course(run: Run, u: Array, given: Array | None = None) -> Course | None:
+    """The conditions along the run of some controls; None where something there has no value.
+
+    Half-vectors may be given, else they are those of the run.
+    """
     st, x = run.statement, run.states(u)
     if not np.isfinite(x).all():
         return None
-    e = np.zeros((x.shape[0], st.ne))
-    if st.path.uses_matrices:
+    e = np.zeros((x.shape[0], st.ne)) if given is None else given
+    if st.path.uses_matrices and given is None:
         e = np.asarray(matrices_of_run(st, run.mesh)(x.T, u.T, run.duration, run.parameters)[0].full()).T
     rows = st.bounded_states
     lower, upper = st.state_bounds
@@ -157,7 +161,7 @@ def _row_slopes(statement: Statement) -> ca.Function:
 def _interval_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     """(states, intervals), a column each -> slopes of their ends by the state and by the controls at both ends."""
     interval = nominal_interval(statement, mesh.substeps, mesh.step)
-    kind = ca.MX if mesh.step == "rodas" else statement.symbolic
+    kind: Any = ca.MX if mesh.step == "rodas" else statement.symbolic
     x, columns = kind.sym("x", statement.nx), Interval.symbols(statement, kind)
     end = interval(x, *columns)[0]
     by = (x, columns.start, columns.end)

@@ -41,6 +41,8 @@ FINE_STEPS = 20
 DETOURS = 40
 # Share of the bend that a control keeps which a way round leaves alone.
 KEPT_BEND = 0.1
+# Shares of the bend at which to look for what lies between the bent and the unbent run.
+BETWEEN = (0.25, 0.5, 0.75)
 
 
 def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
@@ -92,7 +94,8 @@ def _ways_round(
 ) -> Iterator[First]:
     """Starts on the cheapest ways round what the problem's starts run through; none where they run through nothing.
 
-    Those that follow a guess, or that a feedback holds, stay as they are.
+    Where nothing lies on the bent run and on the unbent one, but between them, both count. Starts that follow a guess,
+    or that a feedback holds, stay as they are.
     """
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
     if not plain or own.held or own.unbent is None or not any(states_read(statement)):
@@ -101,22 +104,26 @@ def _ways_round(
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
     run = base_run(statement, mesh, parameters, start, flat)
     tried = [own.unbent, *(t.u for t in others), own.trajectory.u]
-    through = [_runs_through(run, u) for u in tried]
+    through = [_runs_through(run, u, own.trajectory.e) for u in tried]
+    bend = own.trajectory.u - own.unbent
     if not any(through):
+        if any(_runs_through(run, own.unbent + share * bend, own.trajectory.e) for share in BETWEEN):
+            u = run.clip(own.unbent + KEPT_BEND * bend)
+            yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
+            yield replace(own, rival=True)
         return
     roots = tried[:-1] if any(through[:-1]) else tried
     coarse = coarse_mesh(statement, mesh, tuple(parameters), DETOURS)
     least = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, least)
-    bend = KEPT_BEND * (own.trajectory.u - own.unbent)
     for u in detours(run, *targets(run), least, [run.clip(resampled(u, mesh, coarse)) for u in roots]):
         alone = np.abs(u - least).max(axis=0) <= np.finfo(float).eps * np.abs(least).max(axis=0)
-        wanted = resampled(u, coarse, mesh) + np.where(alone, bend, 0.0)
+        wanted = resampled(u, coarse, mesh) + np.where(alone, KEPT_BEND * bend, 0.0)
         yield First(trajectory=completed(statement, mesh, parameters, run.clip(wanted)), plain=own.plain, rival=True)
 
 
-def _runs_through(run: Run, u: Array) -> bool:
-    """Whether a run violates a path condition on states."""
-    along = course(run, u)
+def _runs_through(run: Run, u: Array, e: Array) -> bool:
+    """Whether a run violates a path condition on states, with about these half-vectors."""
+    along = course(run, u, e)
     rows = [k for k, read in enumerate(states_read(run.statement)) if read]
     return along is not None and bool(along.violated[:, rows].any())
