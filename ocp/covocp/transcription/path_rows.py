@@ -25,6 +25,8 @@ from covocp.transcription.trajectory import at_nodes
 
 # Share of the largest value of a condition along a run, and of its limits, up to which it counts as met.
 MET = 1e-3
+# Curvatures below this share of the largest one are none.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,11 +144,41 @@ def reads_time(statement: Statement) -> tuple[bool, ...]:
 
 
 @lru_cache(maxsize=KEPT)
+def curved_rows(statement: Statement) -> tuple[int, ...]:
+    """The path conditions, equations apart, that are not linear in the states: what the others allow is convex."""
+    symbols = model_symbols(statement)
+    by_x, open_ = ca.jacobian(statement.path.function(*symbols), symbols[0]), ~statement.path.equations
+    rows = [k for k, read in enumerate(states_read(statement)) if read and open_[k]]
+    return tuple(k for k in rows if ca.depends_on(by_x[k, :], symbols[0]))
+
+
+def bulges(along: Course, row: int) -> bool:
+    """Whether a condition is violated so that it may be met on two sides: where it is deepest, it is not convex."""
+    st, node = along.run.statement, int(np.argmax(along.excess[:, row]))
+    at = along.points(np.array([node]), along.x[[node]])
+    second = np.asarray(_row_curvatures(st)(*at).full())[row * st.nx : (row + 1) * st.nx]
+    if not np.isfinite(second).all():
+        return True
+    sign = 1.0 if along.values[node, row] > along.upper[row] else -1.0
+    values = np.linalg.eigvalsh(0.5 * sign * (second + second.T))
+    return bool(values.min() < -ROUNDING * np.abs(values).max())
+
+
+@lru_cache(maxsize=KEPT)
 def row_gradients(statement: Statement) -> ca.Function:
     """The arguments of the path conditions -> their slopes by the states."""
     symbols = model_symbols(statement)
     by_x = ca.densify(ca.jacobian(statement.path.function(*symbols), symbols[0]))
     return ca.Function("row_gradients", symbols, [by_x])
+
+
+@lru_cache(maxsize=KEPT)
+def _row_curvatures(statement: Statement) -> ca.Function:
+    """The arguments of the path conditions -> their second slopes by the states, one condition below the other."""
+    symbols = model_symbols(statement)
+    by_x = ca.jacobian(statement.path.function(*symbols), symbols[0])
+    rows = [ca.densify(ca.jacobian(by_x[k, :].T, symbols[0])) for k in range(statement.path.size)]
+    return ca.Function("row_curvatures", symbols, [ca.vertcat(*rows)])
 
 
 @lru_cache(maxsize=KEPT)

@@ -18,7 +18,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.detours import detours
 from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.path_rows import course, states_read
+from covocp.transcription.path_rows import bulges, course, curved_rows
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.starts import (
     First,
@@ -98,7 +98,7 @@ def _ways_round(
     or that a feedback holds, stay as they are.
     """
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
-    if not plain or own.held or own.unbent is None or not any(states_read(statement)):
+    if not plain or own.held or own.unbent is None or not curved_rows(statement):
         return
     start = beside_guesses(statement, mesh, parameters)[0]
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
@@ -123,7 +123,8 @@ def _ways_round(
 
 
 def _runs_through(run: Run, u: Array, e: Array) -> bool:
-    """Whether a run violates a path condition on states, with about these half-vectors."""
+    """Whether a run violates a path condition that may have two sides, with about these half-vectors."""
     along = course(run, u, e)
-    rows = [k for k, read in enumerate(states_read(run.statement)) if read]
-    return along is not None and bool(along.violated[:, rows].any())
+    if along is None:
+        return False
+    return any(along.violated[:, row].any() and bulges(along, row) for row in curved_rows(run.statement))
