@@ -65,7 +65,9 @@ def test_however_the_tree_is_written(form):
 def test_by_every_method(method):
     problem, x, _ = walk()
     problem.subject_to(apart(x, 5.0, 1.5), lower=RADIUS**2)
-    assert co.solve(problem, method, intervals=30, progress=False).cost == pytest.approx(shortest(1.5) ** 2 / TIME, rel=5e-3)
+    assert co.solve(problem, method, intervals=30, progress=False).cost == pytest.approx(
+        shortest(1.5) ** 2 / TIME, rel=5e-3
+    )
 
 
 @pytest.mark.parametrize("place", [(1.2, -0.5)])

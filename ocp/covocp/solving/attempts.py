@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -42,8 +41,10 @@ def from_starts(
     tried: list[tuple[Outcome, Guess]] = []
     refused: list[OutsideDomainError] = []
     best: tuple[Outcome, Guess] | None = None
-    for guess in islice(guesses, TRIED):
-        if best is not None and not guess.rival:
+    others = 0
+    for guess in guesses:
+        others += not guess.rival
+        if others > TRIED or (best is not None and others):
             break
         try:
             outcome = prepared.solve(values, replace(guess, tentative=not guess.warm), reporter)

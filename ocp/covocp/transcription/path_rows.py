@@ -153,7 +153,10 @@ def curved_rows(statement: Statement) -> tuple[int, ...]:
 
 
 def bulges(along: Course, row: int) -> bool:
-    """Whether a condition is violated so that it may be met on two sides: where it is deepest, it is not convex."""
+    """Whether a condition is violated so that it may be met on two sides: where it is deepest, it is not convex.
+
+    Nor known to be where it has no curvature, as the walls of a box.
+    """
     st, node = along.run.statement, int(np.argmax(along.excess[:, row]))
     at = along.points(np.array([node]), along.x[[node]])
     second = np.asarray(_row_curvatures(st)(*at).full())[row * st.nx : (row + 1) * st.nx]
@@ -161,7 +164,7 @@ def bulges(along: Course, row: int) -> bool:
         return True
     sign = 1.0 if along.values[node, row] > along.upper[row] else -1.0
     values = np.linalg.eigvalsh(0.5 * sign * (second + second.T))
-    return bool(values.min() < -ROUNDING * np.abs(values).max())
+    return bool(values.min() < -ROUNDING * np.abs(values).max() or not values.any())
 
 
 @lru_cache(maxsize=KEPT)

@@ -39,10 +39,9 @@ ROUGH_STEPS = 6
 FINE_STEPS = 20
 # Intervals of the mesh on which ways round obstacles are looked for.
 DETOURS = 40
-# Share of the bend that a control keeps which a way round leaves alone.
-KEPT_BEND = 0.1
-# Shares of the bend at which to look for what lies between the bent and the unbent run.
-BETWEEN = (0.25, 0.5, 0.75)
+# Shares of the bend at which to look for what lies between the bent and the unbent run, and the largest that a start
+# beside the unbent run keeps, so that it is no symmetric point.
+SHARES, KEPT_BEND = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), 1 / 16
 
 
 def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
@@ -107,19 +106,26 @@ def _ways_round(
     through = [_runs_through(run, u, own.trajectory.e) for u in tried]
     bend = own.trajectory.u - own.unbent
     if not any(through):
-        if any(_runs_through(run, own.unbent + share * bend, own.trajectory.e) for share in BETWEEN):
-            u = run.clip(own.unbent + KEPT_BEND * bend)
+        u, met = _beside(run, own.unbent, bend, own.trajectory.e)
+        if met:
             yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
             yield replace(own, rival=True)
         return
     roots = tried[:-1] if any(through[:-1]) else tried
     coarse = coarse_mesh(statement, mesh, tuple(parameters), DETOURS)
     least = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
-    run = base_run(statement, coarse, parameters, start, least)
-    for u in detours(run, *targets(run), least, [run.clip(resampled(u, mesh, coarse)) for u in roots]):
+    rough = base_run(statement, coarse, parameters, start, least)
+    for u in detours(rough, *targets(rough), least, [run.clip(resampled(u, mesh, coarse)) for u in roots]):
         alone = np.abs(u - least).max(axis=0) <= np.finfo(float).eps * np.abs(least).max(axis=0)
-        wanted = resampled(u, coarse, mesh) + np.where(alone, KEPT_BEND * bend, 0.0)
-        yield First(trajectory=completed(statement, mesh, parameters, run.clip(wanted)), plain=own.plain, rival=True)
+        u = run.clip(resampled(u, coarse, mesh))
+        u = _beside(run, u, np.where(alone, bend, 0.0), own.trajectory.e)[0] if alone.any() else u
+        yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
+
+
+def _beside(run: Run, u: Array, bend: Array, e: Array) -> tuple[Array, bool]:
+    """Controls with a little of a bend, before it runs through anything; whether more of it does."""
+    met = next((share for share in SHARES if _runs_through(run, u + share * bend, e)), None)
+    return run.clip(u + (KEPT_BEND if met is None else min(KEPT_BEND, 0.5 * met)) * bend), met is not None
 
 
 def _runs_through(run: Run, u: Array, e: Array) -> bool:
