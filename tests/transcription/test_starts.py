@@ -12,7 +12,7 @@ from vehicles import vehicle
 
 import covocp as co
 from covocp.base.progress import Progress
-from covocp.transcription import starts
+from covocp.transcription import ranked_starts
 from covocp.transcription.starts import own_start
 
 # --- a vehicle that turns ---------------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def test_bend_of_the_start_is_measured_by_what_it_does():
 
 
 def test_plain_problem_does_not_look_at_other_starts(monkeypatch):
-    monkeypatch.setattr(starts, "_others", lambda *a: pytest.fail("other starts were made"))
+    monkeypatch.setattr(ranked_starts, "_others", lambda *a: pytest.fail("other starts were made"))
     assert solve(lag().problem, intervals=30).converged
 
 

@@ -154,6 +154,7 @@ class Guess:
         tentative: whether there are others: a method that loses its way should stop.
         scales: units of a program that is made for it; None: chosen by the trajectory.
         held: whether a feedback holds an unstable nominal along it, which need not be the way.
+        rival: whether it is one of several ways round what may not be entered: the cheapest that comes of them counts.
     """
 
     trajectory: Trajectory
@@ -163,5 +164,6 @@ class Guess:
     tentative: bool = False
     scales: Scales | None = None
     held: bool = False
+    rival: bool = False
 
     __repr__ = short_repr

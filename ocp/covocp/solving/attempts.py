@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +29,8 @@ def from_starts(
 
     A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
     all of them, the first run counts: it is made again, and not stopped, where it was stopped. Where a run fails from a
-    start that a feedback holds, there is another one that is left to itself.
+    start that a feedback holds, there is another one that is left to itself. Of rivals, which come first, the cheapest
+    outcome counts.
 
     Returns:
         The outcome, and the start from which it came.
@@ -40,15 +40,24 @@ def from_starts(
     """
     tried: list[tuple[Outcome, Guess]] = []
     refused: list[OutsideDomainError] = []
-    for guess in islice(guesses, TRIED):
+    best: tuple[Outcome, Guess] | None = None
+    others = 0
+    for guess in guesses:
+        others += not guess.rival
+        if others > TRIED or (best is not None and others):
+            break
         try:
             outcome = prepared.solve(values, replace(guess, tentative=not guess.warm), reporter)
         except OutsideDomainError as error:
             refused.append(error)
             continue
         tried.append((outcome, guess))
-        if outcome.converged or not (outcome.stats.get("wandered") or guess.held) or reporter.stop:
+        if outcome.converged and guess.rival and not reporter.stop:
+            best = min(best or tried[-1], tried[-1], key=lambda one: cost_of(one[0]))
+        elif reporter.stop or (not guess.rival and (outcome.converged or not _goes_on(outcome, guess))):
             break
+    if best is not None:
+        return _with_all(best[0], [one for one, _ in tried]), best[1]
     if not tried:
         raise refused[0]
     outcome, guess = tried[-1]
@@ -60,6 +69,19 @@ def from_starts(
     if len(tried) > 1:
         outcome = replace(outcome, stats={**outcome.stats, "tried": len(tried)})
     return outcome, guess
+
+
+def _goes_on(outcome: Outcome, guess: Guess) -> bool:
+    """Whether a run that failed says little of those from other starts."""
+    return bool(outcome.stats.get("wandered")) or guess.held
+
+
+def _with_all(best: Outcome, outcomes: list[Outcome]) -> Outcome:
+    """The best outcome with the iterations and times of all runs."""
+    if len(outcomes) == 1:
+        return best
+    names = [name for name in ("iterations", "solve_seconds") if name in best.stats]
+    return with_stats(best, tried=len(outcomes), **{name: sum(one.stats[name] for one in outcomes) for name in names})
 
 
 def mention_left(error: OutsideDomainError) -> None:

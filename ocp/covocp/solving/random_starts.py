@@ -18,12 +18,12 @@ from covocp.extremal.extremal import Guess
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import check_model, control_scale, controls_guess, is_plain, starts
 from covocp.transcription.mesh import Mesh, control_places
+from covocp.transcription.ranked_starts import ranked
 from covocp.transcription.starts import (
     WIDE,
     base_run,
     bend_size,
     completed,
-    ranked,
     reachable,
     targets,
     untold_units,

@@ -21,7 +21,8 @@ from covocp.statement.names import name_of
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.first_guess import check_measured, simulate_matrices, starts
 from covocp.transcription.mesh import Mesh, control_places
-from covocp.transcription.starts import own_start, ranked
+from covocp.transcription.ranked_starts import ranked
+from covocp.transcription.starts import own_start
 from covocp.transcription.steering import quadrature_weights, resampled
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -60,7 +61,7 @@ def make_guesses(
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
         for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
-            yield Guess(trajectory=first.trajectory, held=first.held)
+            yield Guess(trajectory=first.trajectory, held=first.held, rival=first.rival)
     else:
         raise ProblemError(
             "The guess is of an unknown kind.",

@@ -98,7 +98,7 @@ def merit(run: Run, u: Array) -> tuple[float, float]:
         return np.inf, np.inf
     e, running = np.zeros((x.shape[0], 0)), run.running(u)
     if st.matrices:
-        values = _matrices(st, run.mesh)(x.T, u.T, duration, p)
+        values = matrices_of_run(st, run.mesh)(x.T, u.T, duration, p)
         e, running = np.asarray(values[0].full()).T, float(np.asarray(values[1].full()).sum())
     cost = running + float(st.terminal(x[-1], e[-1], duration, p))
     lower, upper = st.state_bounds
@@ -121,6 +121,6 @@ def merit(run: Run, u: Array) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=KEPT)
-def _matrices(statement: Statement, mesh: Mesh) -> ca.Function:
+def matrices_of_run(statement: Statement, mesh: Mesh) -> ca.Function:
     """See `guess.matrices_function`."""
     return matrices_function(statement, mesh)

@@ -1,14 +1,11 @@
-"""Where a solver starts: one start where the problem is plain, else several cheap ones, ranked before it is called.
+"""Where a solver starts: a problem's own start, and whether it is plain, so that this one start will do.
 
 A problem is plain where a bend of its controls moves the states in proportion to it, and where a step or two of Gauss
-and Newton bring them to their final values. Elsewhere (a vehicle that turns, an arm that swings) there are several
-ways, which a solver does not leave once it has begun: so controls of several shapes and sizes are brought to the final
-values with little energy, on a coarse mesh, and what they cost decides.
+and Newton bring them to their final values. What else there is to start from is in `ranked_starts`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -37,7 +34,6 @@ from covocp.transcription.first_guess import (
 from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred, too_dear
 from covocp.transcription.mesh import Mesh, Options, explicit_substeps
 from covocp.transcription.noticed import looks_wrong, noticed_units
-from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import FAR_UNIT, Run, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
@@ -61,46 +57,23 @@ FAR = 5.0
 GROWTH = 64.0
 # Intervals of the mesh on which starts are compared.
 COARSE = 24
-# Steps of each start before the first ranking, and of those that are left after it.
-ROUGH_STEPS = 6
-FINE_STEPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class First:
-    """The problem's own start, whether no others are worth looking at, and whether a feedback holds it."""
+    """A start, whether no others are worth looking at, whether a feedback holds it, whether it is one of several ways.
+
+    unbent: the controls of the problem's own start before they were bent, where they were; rival: whether what is found
+    from it is to be compared with what is found from the others.
+    """
 
     trajectory: Trajectory
     plain: bool
     held: bool = False
+    unbent: Array | None = None
+    rival: bool = False
 
     __repr__ = short_repr
-
-
-def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
-    """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
-
-    Raises:
-        ProblemError: where a rate is NaN or inf at the start (says which).
-    """
-    own = own_start(statement, mesh, parameters)
-    free = statement.nu > 0 and not statement.coupled
-    if own.plain or not free:
-        yield own
-        if own.held:
-            yield own_start(statement, mesh, parameters, hold=False)
-        if free:
-            yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
-        return
-    found = list(_others(statement, mesh, parameters, own.trajectory))
-    yield from found or [own]
-
-
-def _neutral(statement: Statement) -> Statement:
-    """The statement without the guesses that say how something moves: where they led nowhere."""
-    own = [b for b in (*statement.states, *statement.controls) if b.role == "moving"]
-    moving = [b.name for b in own if not is_plain(statement.guesses[b.name])]
-    return replace(statement, guesses={**statement.guesses, **dict.fromkeys(moving)}) if moving else statement
 
 
 def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool = True) -> First:
@@ -121,16 +94,16 @@ def _own_start(statement: Statement, mesh: Mesh, values: tuple[float, ...], hold
     u = controls_guess(statement, mesh.nodes, mesh.control)
     start, e0 = beside_guesses(statement, mesh, parameters)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
-    plain, run = True, None
+    plain, run, unbent = True, None, None
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
         run = _held(statement, mesh, values) if hold else None
-        followed = _followed(statement)
+        followed = followed_states(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)
         else:
             flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
             units = untold_units(statement, mesh, parameters, flat)
-            u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
+            u, unbent, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
     elif statement.nu and statement.coupled:
         u = _within_reach(statement, mesh, parameters, u)
     left = completed(statement, mesh, parameters, u)
@@ -138,10 +111,10 @@ def _own_start(statement: Statement, mesh: Mesh, values: tuple[float, ...], hold
         other = completed(statement, mesh, parameters, u, start=starts(statement, mesh, parameters)[0])
         left = other if _ends_well(statement, other, parameters) else left
     if run is None:
-        return First(trajectory=left, plain=plain)
+        return First(trajectory=left, plain=plain, unbent=unbent)
     kept = completed(statement, mesh, parameters, run.u.copy(), x=run.x.copy())
     if too_dear(_told_run(statement, mesh, parameters, start), kept, left):
-        return First(trajectory=left, plain=plain)
+        return First(trajectory=left, plain=plain, unbent=unbent)
     return First(trajectory=kept, plain=True, held=True)
 
 
@@ -279,7 +252,7 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     return excited(run, line, aimed, flat, bend)
 
 
-def _followed(statement: Statement) -> tuple[int, ...]:
+def followed_states(statement: Statement) -> tuple[int, ...]:
     """States whose guess says how they move: an array or a function."""
     moving = [b for b in statement.states if b.role == "moving" and not is_plain(statement.guesses[b.name])]
     rows = [list(range(b.span.start, b.span.stop)) for b in moving]
@@ -288,7 +261,7 @@ def _followed(statement: Statement) -> tuple[int, ...]:
 
 def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[int, ...]) -> Array:
     """Controls along which some states follow their guesses, as far as they can."""
-    coarse = _coarse(statement, mesh, tuple(parameters))
+    coarse = coarse_mesh(statement, mesh, tuple(parameters))
     path = np.zeros((coarse.intervals + 1, statement.nx))
     for block in statement.states:
         guess = statement.guesses[block.name]
@@ -297,18 +270,18 @@ def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[in
     start = beside_guesses(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
-    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat, path))
+    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=bend_units(run, flat, path))
     return run.clip(resampled(track(run, rows, path[:, list(rows)], flat), coarse, mesh))
 
 
-def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, bool]:
-    """Controls steered to the final values and bent, in units that nothing else tells; whether the problem is plain.
+def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, Array | None, bool]:
+    """Controls steered to the final values and bent, in units that nothing else tells; the same unbent; whether plain.
 
     The bend 1 - s breaks symmetries; where the terminal conditions prefer a direction, it must not oppose them, and a
     control that they move far has no symmetry left to break.
     """
     if not np.isfinite(run.start).all():
-        return bent, True
+        return bent, None, True
     sizes = np.abs(bent - flat).max(axis=0)
     bend = (bent - flat) * np.maximum(units, 1.0) * reachable(run, flat, sizes)
     size = bend_size(run, flat, bend)
@@ -317,7 +290,8 @@ def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, bool
     steered, left = steer(run, fixed, target, flat) if fixed else (flat, 0.0)
     sign = np.where(np.sum((steered - flat) * bend, axis=0) < 0, -1.0, 1.0)
     far = np.linalg.norm(steered - flat, axis=0) > FAR * size * np.linalg.norm(bend, axis=0)
-    return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
+    u = run.clip(steered + np.where(far, 0.0, sign) * size * bend)
+    return u, steered, size >= 1.0 and left <= PLAIN_MISS
 
 
 def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Array) -> Array:
@@ -453,7 +427,7 @@ def _of_vectors(statement: Statement, rows: list[int], sizes: Array) -> Array:
     return np.where(result > 0, result, 1.0)[rows]
 
 
-def _units(run: Run, flat: Array, path: Array | None = None) -> Array:
+def bend_units(run: Run, flat: Array, path: Array | None = None) -> Array:
     """Sizes of the bends of each control, from their effect on the states, which may have a path: constant changes."""
     statement, units = run.statement, np.ones(run.statement.nu)
     for block in statement.controls:
@@ -468,28 +442,12 @@ def _units(run: Run, flat: Array, path: Array | None = None) -> Array:
 
 
 @lru_cache(maxsize=KEPT)
-def _coarse(statement: Statement, mesh: Mesh, parameters: tuple[float, ...]) -> Mesh:
+def coarse_mesh(statement: Statement, mesh: Mesh, parameters: tuple[float, ...], most: int = COARSE) -> Mesh:
     """The mesh on which starts are compared, with as many steps as the rates need."""
-    count = min(COARSE, mesh.intervals)
+    count = min(most, mesh.intervals)
     nodes = np.linspace(0.0, 1.0, count + 1)
     stiff = stiffness(statement, Options(grid=nodes), np.array(parameters))
     steps = IMPLICIT_SUBSTEPS if mesh.step == "rodas" else max(2, explicit_substeps(stiff.nominal))
     none = np.zeros((mesh.readings.shape[0], count))
     steps += steps % 2
     return replace(mesh, nodes=nodes, substeps=steps, segments=(count,), eliminated=True, points=1, readings=none)
-
-
-def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory) -> Iterator[First]:
-    """Starts of several shapes and sizes, brought to the final values with little energy, the cheapest first."""
-    coarse = _coarse(statement, mesh, tuple(parameters))
-    flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
-    run = base_run(statement, coarse, parameters, beside_guesses(statement, mesh, parameters)[0], flat)
-    run = replace(run, units=_units(run, flat))
-    fixed, target = targets(run)
-    each = shapes(run, flat, resampled(own.u, mesh, coarse))
-    best = distinct([judged(run, fixed, target, shape, flat, ROUGH_STEPS) for shape in each])
-    if fixed:
-        best = distinct([judged(run, fixed, target, entry.u, flat, FINE_STEPS) for entry in best])
-    for entry in best:
-        u = run.clip(resampled(unsymmetric(run, entry.u, flat), coarse, mesh))
-        yield First(trajectory=completed(statement, mesh, parameters, u), plain=False)

@@ -1,0 +1,184 @@
+"""Ways round obstacles: an obstacle is passed on the cheap side, wherever the start was bent to."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import solve
+
+import covocp as co
+from covocp.transcription import ranked_starts
+
+RADIUS, LENGTH, TIME = 2.0, 10.0, 10.0
+
+
+def shortest(offset: float, goal: float = LENGTH, radius: float = RADIUS) -> float:
+    """Length of the shortest way round a circle that stands beside the middle of the straight line: two tangents."""
+    half, far = goal / 2, float(np.hypot(goal / 2, offset))
+    turn = 2 * np.arctan2(half, abs(offset)) - 2 * np.arccos(radius / far)
+    return float(2 * np.sqrt(far**2 - radius**2) + radius * turn)
+
+
+def walk(dimensions: int = 2, unit: float = 1.0, duration: float = TIME) -> tuple[co.Problem, ca.SX, ca.SX]:
+    """A point whose velocity is its control, from the origin to somewhere on the first axis: cost length^2 / time."""
+    goal = [LENGTH * unit, *[0.0] * (dimensions - 1)]
+    problem = co.Problem(duration=duration, name="walk")
+    x = problem.state("x", dimensions, initial=[0.0] * dimensions, final=goal)
+    u = problem.control("u", dimensions)
+    problem.dynamics(x, u)
+    problem.minimize(running=ca.sumsqr(u / unit))
+    return problem, x, u
+
+
+def apart(x: ca.SX, *place: float) -> ca.SX:
+    """Squared distance of a place."""
+    return ca.sumsqr(x - ca.DM(list(place)))
+
+
+# --- one obstacle: the closed form ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("offset", "unit"), [(0.3, 1.0), (-1.5, 1.0), (1.0, 1e3), (1.5, 1e-5)])
+def test_a_tree_is_passed_on_the_near_side_in_any_unit(offset, unit):
+    problem, x, _ = walk(unit=unit)
+    problem.subject_to(apart(x / unit, 5.0, offset), lower=RADIUS**2, name="tree")
+    assert solve(problem, intervals=50).cost == pytest.approx(shortest(offset) ** 2 / TIME, rel=2e-3)
+
+
+FORMS = {
+    "other sign": lambda d: (RADIUS**2 - d, 0.0),
+    "distance": lambda d: (RADIUS - ca.sqrt(d), 0.0),
+    "bump": lambda d: (ca.exp(-d), np.exp(-(RADIUS**2))),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_however_the_tree_is_written(form):
+    problem, x, _ = walk()
+    value, upper = FORMS[form](apart(x, 5.0, 1.5))
+    problem.subject_to(value, upper=upper)
+    assert solve(problem, intervals=50).cost == pytest.approx(shortest(1.5) ** 2 / TIME, rel=2e-3)
+
+
+@pytest.mark.parametrize("method", ["reduced", "auto", "gradient"])
+def test_by_every_method(method):
+    problem, x, _ = walk()
+    problem.subject_to(apart(x, 5.0, 1.5), lower=RADIUS**2)
+    assert co.solve(problem, method, intervals=30, progress=False).cost == pytest.approx(
+        shortest(1.5) ** 2 / TIME, rel=5e-3
+    )
+
+
+@pytest.mark.parametrize("place", [(1.2, -0.5)])
+def test_a_ball_in_space(place):
+    """The shortest way lies in the plane of the line and the centre."""
+    problem, x, _ = walk(3)
+    problem.subject_to(apart(x, 5.0, *place), lower=RADIUS**2, name="ball")
+    cost = shortest(float(np.hypot(*place))) ** 2 / TIME
+    assert solve(problem, intervals=50).cost == pytest.approx(cost, rel=2e-3)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_tree_that_moves_along(side):
+    """Beside it the goal moves back, the way is the shortest one there; |u|^2 = |u' + w|^2."""
+    drift = 0.2
+    problem, x, _ = walk()
+    nearer = LENGTH - drift * TIME
+    problem.subject_to(apart(x - ca.vertcat(drift * problem.time, 0), nearer / 2, side * 1.2), lower=RADIUS**2)
+    cost = shortest(1.2, nearer) ** 2 / TIME + 2 * drift * nearer + drift**2 * TIME
+    assert solve(problem, intervals=50).cost == pytest.approx(cost, rel=2e-3)
+
+
+def test_a_tree_between_the_straight_line_and_the_bent_start():
+    """Nothing lies on the straight line, which is the shortest way."""
+    problem, x, _ = walk()
+    own = ranked_starts.own_start(problem.statement(), co.Solver(problem).solve(progress=False).mesh, np.zeros(0))
+    side = np.sign(own.trajectory.x[25, 1])
+    problem.subject_to(apart(x, 5.0, side * 0.7), lower=0.6**2)
+    assert solve(problem, intervals=50).cost == pytest.approx(LENGTH**2 / TIME, rel=1e-6)
+
+
+# --- several obstacles, other vehicles: the best of many guesses ------------------------------------------------------
+
+TREES = [(2.6, 0.4, 1.0), (5.2, -0.5, 1.1), (7.6, 0.45, 0.9)]
+
+
+def vehicle(kind: str) -> tuple[co.Problem, ca.SX]:
+    """From the origin to (10, 0): with an acceleration, in a free time, or as a unicycle."""
+    free = co.Free(10.0, lower=2.0, upper=40.0)
+    problem = co.Problem(duration=free if kind == "free" else TIME, name=kind)
+    x = problem.state("x", 2, initial=[0.0, 0.0], final=[LENGTH, 0.0])
+    if kind == "unicycle":
+        heading, u = problem.state("heading", initial=0.0), problem.control("u")
+        problem.dynamics(x, 1.15 * ca.vertcat(ca.cos(heading), ca.sin(heading)))
+        problem.dynamics(heading, u)
+    else:
+        v = problem.state("v", 2, initial=[0.0, 0.0], final=[0.0, 0.0])
+        u = problem.control("u", 2, lower=-2.0, upper=2.0)
+        problem.dynamics(x, v)
+        problem.dynamics(v, u)
+    problem.minimize(running=ca.sumsqr(u) + (1.0 if kind == "free" else 0.0))
+    return problem, x
+
+
+@pytest.mark.parametrize("kind", ["acceleration", "free", "unicycle"])
+def test_among_three_trees_as_cheap_as_the_best_of_all_sides(kind):
+    problem, x = vehicle(kind)
+    for i, (a, b, radius) in enumerate(TREES):
+        problem.subject_to(apart(x, a, b), lower=radius**2, name=f"tree {i}")
+    solver, costs = co.Solver(problem, intervals=30), []
+    for sides in np.ndindex(2, 2, 2):
+        beside = [[a, b + (2 * s - 1) * 1.1 * r] for (a, b, r), s in zip(TREES, sides, strict=True)]
+        guess = {"x": [[0.0, 0.0], *beside, [LENGTH, 0.0]]}
+        other = solver.solve(guess=guess, progress=False, assess=False, allow_failure=True, iteration_limit=60)
+        costs += [other.cost] if other.converged else []
+    assert solver.solve(progress=False, assess=False).cost <= 1.001 * min(costs)
+    assert max(costs) > 1.05 * min(costs)
+
+
+def test_the_later_of_two_phases_passes_on_the_near_side():
+    first, x, _ = walk()
+    second = co.Problem(duration=TIME, name="on")
+    y = second.state("x", 2, initial=None, final=[2 * LENGTH, 0.0])
+    u = second.control("u", 2)
+    second.dynamics(y, u)
+    second.minimize(running=ca.sumsqr(u))
+    second.subject_to(apart(y, 15.0, 1.5), lower=RADIUS**2)
+    assert x.shape == y.shape
+    phases = co.Phases([first, second], name="two")
+    cost = (LENGTH**2 + shortest(1.5) ** 2) / TIME
+    assert co.solve(phases, intervals=40, progress=False).cost == pytest.approx(cost, rel=2e-3)
+
+
+# --- where nothing is looked for --------------------------------------------------------------------------------------
+
+
+def test_a_guess_says_on_which_side():
+    problem, x, _ = walk()
+    problem.subject_to(apart(x, 5.0, 1.0), lower=RADIUS**2)
+    solution = solve(problem, intervals=40, guess={"x": [[0.0, 0.0], [5.0, 3.2], [LENGTH, 0.0]]})
+    assert solution.at(5.0)["x"][1] == pytest.approx(3.0, abs=1e-3)
+
+
+CONVEX = {
+    "within a disc": lambda x, u: (apart(x, 5.0, 4.0), 41.5),
+    "a wall": lambda x, u: (ca.vertcat(x[1], -x[1]) - 0.01, 0.0),
+    "a control": lambda x, u: (-ca.sumsqr(u), -0.5),
+}
+
+
+@pytest.mark.parametrize("name", CONVEX)
+def test_what_has_one_side_is_left_alone(name, monkeypatch):
+    monkeypatch.setattr(ranked_starts, "detours", lambda *a: pytest.fail("other sides were looked for"))
+    problem, x, u = walk()
+    value, upper = CONVEX[name](x, u)
+    problem.subject_to(value, upper=upper)
+    assert solve(problem, intervals=30).cost == pytest.approx(LENGTH**2 / TIME, rel=1e-5)
+
+
+def test_nothing_is_looked_for_where_the_start_runs_free(monkeypatch):
+    monkeypatch.setattr(ranked_starts, "detours", lambda *a: pytest.fail("other sides were looked for"))
+    problem, x, _ = walk()
+    problem.subject_to(apart(x, 5.0, 30.0), lower=RADIUS**2)
+    assert solve(problem, intervals=30).converged
