@@ -128,7 +128,7 @@ class GradientChainSolver:
             link_multipliers=space.link_multipliers(iterate, linear, measures),
             bounds_at_ends=tuple((np.zeros_like(last), last) for last in at_ends),
             cost_terms=tuple({"terminal": own.run.terminal, "running": own.run.running} for own in iterate.parts),
-            converged=end.status is Status.SOLVED,
+            converged=end.status.solved,
             message=end.status.told(misled),
             violations=judged.violations(iterate, self._settings.violation_tolerance),
             stats=counts,

@@ -315,7 +315,7 @@ class GradientSolver:
                 )
             ),
             cost_terms={"terminal": run.terminal, "running": run.running},
-            converged=end.status is Status.SOLVED,
+            converged=end.status.solved,
             message=end.status.told(misled),
             violations=space.violations(end.iterate, self._settings.violation_tolerance),
             stats=stats,

@@ -38,6 +38,7 @@ from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
 from covocp.solving.farther import in_larger_units
+from covocp.solving.from_best_gain import kept_by_best
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
@@ -277,6 +278,9 @@ class Solver:
             self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
         if assess and guess is None and first is None:
             self._look_at_steps(values)
+        kept = self._kept_by_best(values, guess, reporter)
+        if kept is not None:
+            return kept, first
         try:
             outcome, start = self._from_start(values, guess, first, reporter)
         except OutsideDomainError as error:
@@ -290,6 +294,17 @@ class Solver:
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
+
+    def _kept_by_best(self, values: Array, guess: Given, reporter: Progress) -> Outcome | None:
+        """The outcome from a solution with the best gain that keeps the conditions; None where there is none.
+
+        It is the optimum with them, too: nobody looks for a better one beside it.
+        """
+        start = kept_by_best(self._solved, self._prepared.mesh, values, guess) if isinstance(guess, Solution) else None
+        if start is None or reporter.stop:
+            return None
+        outcome = self._prepared.solve(values, start, reporter)
+        return outcome if outcome.converged or reporter.stop else None
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
