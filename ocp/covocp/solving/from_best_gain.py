@@ -11,9 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
+from covocp.base.progress import Progress
 from covocp.extremal.costates import discrete_costates
-from covocp.extremal.extremal import Extremal, Guess
+from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.given_controls import missed
 from covocp.solution.solution import Solution
@@ -24,27 +26,55 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers
 
+# Iterations within which a run from the best gain with its multipliers finds its way, mostly in fewer than 30.
+PATIENCE = 60
+# The cost with conditions on X is no less than that without, but for other minima: so far below, as a share of it.
+BELOW = 0.5
 
-def kept_by_best(statement: Statement, mesh: Mesh, parameters: Array, best: Solution) -> Guess | None:
-    """The start that is an optimum, but for the form of its gain between the nodes; None where `best` is none.
+
+def from_best(
+    statement: Statement, prepared: Prepared, parameters: Array, best: Solution, reporter: Progress, *, further: bool
+) -> tuple[Outcome, Guess, bool] | None:
+    """The outcome from a solution with the best gain and its multipliers; None where they lead nowhere.
 
     Args:
         statement: the problem, whose gain is optimised.
-        mesh: of the run.
+        prepared: made ready.
         parameters: of the statement.
         best: solution with the best gain, perhaps with more or fewer conditions.
+        reporter: of iterations.
+        further: whether it is a start, too, where it does not keep the conditions.
+
+    Returns:
+        The outcome, where it began, and whether it is the optimum that `best` is.
     """
-    guess = start_with_multipliers(statement, mesh, parameters, best)
-    if guess is None or missed(refined(_extremal(statement, mesh, parameters, guess))):
+    start = start_with_multipliers(statement, prepared.mesh, parameters, best)
+    if start is None or reporter.stop:
         return None
-    return guess
+    kept = not missed(refined(_extremal(statement, prepared.mesh, parameters, start)))
+    if not (kept or further):
+        return None
+    try:
+        outcome = prepared.solve(parameters, start, part(reporter, PATIENCE, best))
+    except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved; other starts may do
+        return None
+    if reporter.stop and not outcome.converged:
+        return outcome, start, kept
+    lower = best.cost - BELOW * abs(best.cost)
+    return (outcome, start, kept) if outcome.converged and sum(outcome.cost_terms.values()) >= lower else None
+
+
+def part(reporter: Progress, iterations: int | None, best: Solution) -> Progress:
+    """A part of what is reported, with so many iterations, of a run whose cost cannot be far below that of `best`."""
+    floor = best.cost - BELOW * abs(best.cost)
+    return Progress("", show=False, iterations=iterations, within=reporter, floor=floor)
 
 
 def start_with_multipliers(statement: Statement, mesh: Mesh, parameters: Array, best: Solution) -> Guess | None:
     """The start along a solution with the best gain with its multipliers; None where they are not those of a start.
 
     That is so where another gain would be the best one: where it is bounded, or X in the cost otherwise than linearly.
-    Arguments as of `kept_by_best`.
+    Arguments as of `from_best`, `mesh` of the run.
     """
     if not _is_best(statement, mesh, parameters, best):
         return None

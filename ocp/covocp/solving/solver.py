@@ -38,7 +38,7 @@ from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
 from covocp.solving.farther import in_larger_units
-from covocp.solving.from_best_gain import kept_by_best
+from covocp.solving.from_best_gain import from_best
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
@@ -278,11 +278,14 @@ class Solver:
             self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
         if assess and guess is None and first is None:
             self._look_at_steps(values)
-        kept = self._kept_by_best(values, guess, reporter)
-        if kept is not None:
-            return kept, first
+        found = None
+        if isinstance(guess, Solution):
+            further = first is guess and self._by_ipopt
+            found = from_best(self._solved, self._prepared, values, guess, reporter, further=further)
+        if found is not None and found[2]:  # the optimum with the best gain: nobody looks for another one beside it
+            return found[0], first
         try:
-            outcome, start = self._from_start(values, guess, first, reporter)
+            outcome, start = found[:2] if found is not None else self._from_start(values, guess, first, reporter)
         except OutsideDomainError as error:
             if not isinstance(given, Later | Solution):
                 raise
@@ -294,17 +297,6 @@ class Solver:
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
-
-    def _kept_by_best(self, values: Array, guess: Given, reporter: Progress) -> Outcome | None:
-        """The outcome from a solution with the best gain that keeps the conditions; None where there is none.
-
-        It is the optimum with them, too: nobody looks for a better one beside it.
-        """
-        start = kept_by_best(self._solved, self._prepared.mesh, values, guess) if isinstance(guess, Solution) else None
-        if start is None or reporter.stop:
-            return None
-        outcome = self._prepared.solve(values, start, reporter)
-        return outcome if outcome.converged or reporter.stop else None
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
