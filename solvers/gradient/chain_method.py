@@ -19,7 +19,6 @@ from covocp.solvers.gradient.iterate import Space, make_space, point_of
 from covocp.solvers.gradient.lengths import lengths
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings
-from covocp.solvers.gradient.statuses import Status
 from covocp.statement.chain import Chain, Link
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options

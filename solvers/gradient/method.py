@@ -49,7 +49,6 @@ from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.records import Iterate
 from covocp.solvers.gradient.search import End, Search, Settings, Variant
-from covocp.solvers.gradient.statuses import Status
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess

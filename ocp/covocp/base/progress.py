@@ -10,7 +10,7 @@ import time
 from types import FrameType, TracebackType
 from typing import Any
 
-# Iterates one after the other that are below the floor of the cost and violate less than this: the run has lost its way.
+# So many iterates one after the other below the floor of the cost that violate less than this have lost their way.
 LOST, NEAR = 10, 1e-2
 
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from covocp.solution.solution import Solution
 
 # Share of the largest variances of X up to which the covariance of the estimate is known where it is a variable of the
-# program, what a converged point may violate its steps by: after few readings it is singular, before them zero.
+# program or follows from a gain that is one, what a converged point may violate steps by: after few readings it is
+# singular, before them zero.
 ITERATED = VIOLATION
 
 
@@ -31,7 +32,7 @@ def all_covariances(solution: Solution) -> list[Array]:
 
 def are_semidefinite(solution: Solution) -> bool:
     """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-    if solution.loop is None or solution.mesh.eliminated:
+    if solution.loop is None or (solution.mesh.eliminated and ESTIMATE not in solution.values):
         return all(map(is_semidefinite, all_covariances(solution)))
     estimates = [solution.values.get(ESTIMATE), solution.loop.Xhat]
     others = [matrix for matrix in all_covariances(solution) if all(matrix is not own for own in estimates)]

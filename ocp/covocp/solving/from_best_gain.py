@@ -64,10 +64,18 @@ def from_best(
     return (outcome, start, kept) if outcome.converged and sum(outcome.cost_terms.values()) >= lower else None
 
 
-def part(reporter: Progress, iterations: int | None, best: Solution) -> Progress:
-    """A part of what is reported, with so many iterations, of a run whose cost cannot be far below that of `best`."""
-    floor = best.cost - BELOW * abs(best.cost)
-    return Progress("", show=False, iterations=iterations, within=reporter, floor=floor)
+def part(reporter: Progress, iterations: int | None, best: Solution, *, floor: bool = True) -> Progress:
+    """A part of what is reported, with so many iterations; `floor`: the cost cannot be far below that of `best`.
+
+    It cannot where no cost is taken of X that `best` does not have.
+    """
+    least = best.cost - BELOW * abs(best.cost) if floor else -np.inf
+    return Progress("", show=False, iterations=iterations, within=reporter, floor=least)
+
+
+def bounded_below(statement: Statement) -> bool:
+    """Whether the cost is no less than with the best gain: X is in it as a weight only."""
+    return statement.loop is not None and statement.loop.spread is None
 
 
 def start_with_multipliers(statement: Statement, mesh: Mesh, parameters: Array, best: Solution) -> Guess | None:
@@ -106,8 +114,13 @@ def _is_best(statement: Statement, mesh: Mesh, parameters: Array, best: Solution
 def _extremal(statement: Statement, mesh: Mesh, parameters: Array, guess: Guess) -> Extremal:
     """A start as data."""
     assert guess.multipliers is not None
-    known = {"trajectory": guess.trajectory, "multipliers": guess.multipliers}
-    return Extremal(stated=statement, mesh=mesh, parameters=parameters, **known)
+    return Extremal(
+        stated=statement,
+        mesh=mesh,
+        trajectory=guess.trajectory,
+        parameters=parameters,
+        multipliers=guess.multipliers,
+    )
 
 
 def _carried(statement: Statement, mesh: Mesh, best: Solution) -> Multipliers:
@@ -133,7 +146,8 @@ def _carried(statement: Statement, mesh: Mesh, best: Solution) -> Multipliers:
 def _by_name(own: Conditions, other: Conditions, multipliers: Array) -> Array:
     """Multipliers of some conditions from those of others, rows along the last axis."""
     known = {name: k for k, name in enumerate(other.names)}
-    zero = np.zeros(multipliers.shape[:-1])
-    return np.stack([multipliers[..., known[n]] if n in known else zero for n in own.names], axis=-1) if own.names else (
-        np.zeros((*multipliers.shape[:-1], 0))
-    )
+    result = np.zeros((*multipliers.shape[:-1], len(own.names)))
+    for k, name in enumerate(own.names):
+        if name in known:
+            result[..., k] = multipliers[..., known[name]]
+    return result
