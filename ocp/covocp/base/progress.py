@@ -40,7 +40,7 @@ class Progress:
         floor: float = -math.inf,
     ) -> None:
         """Nothing is shown before the context is entered."""
-        self.asked = False
+        self._asked = False
         self._within, self._floor, self._below = within, floor, 0
         self._seconds, self._iterations = seconds, iterations
         self._begin, self._seen = time.perf_counter(), 0
@@ -71,6 +71,18 @@ class Progress:
         if self._previous is not None:
             signal.signal(signal.SIGINT, self._previous)
             self._previous = None
+
+    @property
+    def asked(self) -> bool:
+        """Whether the user asked to stop."""
+        return self._asked if self._within is None else self._within.asked
+
+    @asked.setter
+    def asked(self, value: bool) -> None:
+        if self._within is None:
+            self._asked = value
+        else:
+            self._within.asked = value
 
     @property
     def spent(self) -> str:

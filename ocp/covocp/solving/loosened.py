@@ -81,7 +81,8 @@ def _sequence(
 ) -> Outcome | None:
     """The outcome of the problem itself, or the best until a limit is reached; None where steps became too small."""
     parameters = failed.extremal.parameters
-    start = start_with_multipliers(statement, mesh, parameters, best) or make_guess(statement, mesh, parameters, best)
+    start = None if mesh.step == "rk4" else start_with_multipliers(statement, mesh, parameters, best)
+    start = make_guess(statement, mesh, parameters, best) if start is None else start
     room = {
         name: _missed(getattr(statement, name), name, start.trajectory, mesh, parameters) for name in ("path", "end")
     }
