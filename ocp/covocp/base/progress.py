@@ -93,7 +93,11 @@ class Progress:
             return f"the limit of {self._seconds:g} s"
         if self._below >= LOST:
             return f"a cost of {self._floor:.4g}, below which there is no solution"
-        return ""
+        return "" if self._within is None else self._within.spent
+
+    def believes(self, cost: float) -> bool:
+        """Whether an iterate of this cost may be on the way to a solution."""
+        return cost >= self._floor
 
     @property
     def limited(self) -> bool:
