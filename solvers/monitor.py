@@ -139,7 +139,7 @@ class Monitor(ca.Callback):
         if self._progress is None:
             return False
         violation = float(beyond(g, self._bounds["lbg"], self._bounds["ubg"]).max(initial=0.0))
-        if self._progress.limited:
+        if self._progress.limited and self._progress.believes(cost * self._scale):
             one = Iterate(w=w, lam_x=lam_x, lam_g=lam_g, cost=cost, violation=violation)
             if self.best is None or one.rank < self.best.rank:
                 self.best = replace(one, w=w.copy(), lam_x=lam_x.copy(), lam_g=lam_g.copy())

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import threading
 import time
 from types import FrameType, TracebackType
 from typing import Any
+
+# So many iterates one after the other below the floor of the cost that violate less than this have lost their way.
+LOST, NEAR = 10, 1e-2
 
 
 class Progress:
@@ -21,13 +25,23 @@ class Progress:
         show: whether to show the line; only ever shown when the standard error is a terminal.
         seconds: that may pass from entering the context on; None: no limit.
         iterations: that may be reported, beside that of the start; None: no limit.
+        within: of what this is a part, with a limit of its own: it is told, and stops both.
+        floor: of the cost: iterates below it that violate next to nothing, many of them, have lost their way.
     """
 
     def __init__(
-        self, title: str, show: bool = True, *, seconds: float | None = None, iterations: int | None = None
+        self,
+        title: str,
+        show: bool = True,
+        *,
+        seconds: float | None = None,
+        iterations: int | None = None,
+        within: Progress | None = None,
+        floor: float = -math.inf,
     ) -> None:
         """Nothing is shown before the context is entered."""
-        self.asked = False
+        self._asked = False
+        self._within, self._floor, self._below = within, floor, 0
         self._seconds, self._iterations = seconds, iterations
         self._begin, self._seen = time.perf_counter(), 0
         self._title = title
@@ -59,18 +73,37 @@ class Progress:
             self._previous = None
 
     @property
+    def asked(self) -> bool:
+        """Whether the user asked to stop."""
+        return self._asked if self._within is None else self._within.asked
+
+    @asked.setter
+    def asked(self, value: bool) -> None:
+        if self._within is None:
+            self._asked = value
+        else:
+            self._within.asked = value
+
+    @property
     def spent(self) -> str:
         """The limit that is reached, in words; "" where none is."""
         if self._iterations is not None and self._seen > self._iterations:
             return f"the limit of {self._iterations} iterations"
         if self._seconds is not None and time.perf_counter() - self._begin >= self._seconds:
             return f"the limit of {self._seconds:g} s"
-        return ""
+        if self._below >= LOST:
+            return f"a cost of {self._floor:.4g}, below which there is no solution"
+        return "" if self._within is None else self._within.spent
+
+    def believes(self, cost: float) -> bool:
+        """Whether an iterate of this cost may be on the way to a solution."""
+        return cost >= self._floor
 
     @property
     def limited(self) -> bool:
         """Whether a limit may end the iterations."""
-        return self._seconds is not None or self._iterations is not None
+        own = self._seconds is not None or self._iterations is not None or self._floor > -math.inf
+        return own or (self._within is not None and self._within.limited)
 
     @property
     def left(self) -> tuple[float | None, int | None]:
@@ -86,16 +119,19 @@ class Progress:
     @property
     def stop(self) -> bool:
         """Whether the method should end."""
-        return self.asked or bool(self.spent)
+        return self.asked or bool(self.spent) or (self._within is not None and self._within.stop)
 
     @property
     def shown(self) -> bool:
         """Whether somebody watches."""
-        return self._show
+        return self._show if self._within is None else self._within.shown
 
     def update(self, iteration: int, cost: float, violation: float) -> None:
         """Report an iteration: its number, its cost, the largest violation of a constraint (scaled)."""
         self._seen += 1
+        self._below = self._below + 1 if cost < self._floor and violation < NEAR else 0
+        if self._within is not None:
+            self._within.update(iteration, cost, violation)
         if self._status is not None:
             self._status.update(f"{self._title}: iteration {iteration}, cost {cost:.8g}, violation {violation:.1e}")
 

@@ -9,6 +9,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite
+from covocp.base.residuals import VIOLATION
 from covocp.solution.reading import name_in
 from covocp.statement.augmented import augmented_blocks, check_no_quaternion_entry
 from covocp.statement.names import block_of
@@ -17,9 +18,10 @@ from covocp.transcription.before_reading import ESTIMATE
 if TYPE_CHECKING:
     from covocp.solution.solution import Solution
 
-# Share of the largest eigenvalue of X up to which the covariance of the estimate is known where it is a variable of
-# the program: after few readings it is singular, before them zero.
-ITERATED = 1e-9
+# Share of the largest variances of X up to which the covariance of the estimate is known where it is a variable of the
+# program or follows from a gain that is one, what a converged point may violate steps by: after few readings it is
+# singular, before them zero.
+ITERATED = VIOLATION
 
 
 def all_covariances(solution: Solution) -> list[Array]:
@@ -30,7 +32,7 @@ def all_covariances(solution: Solution) -> list[Array]:
 
 def are_semidefinite(solution: Solution) -> bool:
     """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-    if solution.loop is None or solution.mesh.eliminated:
+    if solution.loop is None or (solution.mesh.eliminated and ESTIMATE not in solution.values):
         return all(map(is_semidefinite, all_covariances(solution)))
     estimates = [solution.values.get(ESTIMATE), solution.loop.Xhat]
     others = [matrix for matrix in all_covariances(solution) if all(matrix is not own for own in estimates)]

@@ -20,6 +20,7 @@ from covocp.extremal.fine_mesh import refined
 from covocp.extremal.given_controls import missed
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, rank, with_stats
+from covocp.solving.from_best_gain import bounded_below, part, start_with_multipliers
 from covocp.solving.warm_start import make_guess
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
@@ -29,6 +30,8 @@ from covocp.transcription.trajectory import Trajectory
 
 # Iterations after which a run gives up where there is this other way; of each step of it, and of the last.
 PATIENCE, PATIENCE_OF_STEPS = 400, 150
+# Of all steps of it together: where it leads somewhere, it mostly takes fewer than 250.
+MOST_ITERATIONS = 400
 # First step of the share by which limits are loosened, the smallest one, and the most steps.
 FIRST, SMALLEST, MOST = 0.5, 0.02, 20
 # What the start misses of a limit is allowed with so much more.
@@ -47,7 +50,9 @@ def can_be_loosened(statement: Statement) -> bool:
     )
 
 
-def tightened(statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress) -> Outcome:
+def tightened(
+    statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress, mesh: Mesh | None = None
+) -> Outcome:
     """The outcome by way of problems whose limits are loosened less and less, the last one not at all; else as before.
 
     Where a limit ends the way, or the user does, the best point until then counts, by what it violates of the problem.
@@ -58,20 +63,26 @@ def tightened(statement: Statement, failed: Outcome, best: Solution, ready: Read
         best: with the best gain, where to start; what the limits are loosened for.
         ready: makes a problem like it ready on the same mesh.
         reporter: of iterations.
+        mesh: of these runs; None: that of the run before.
     """
-    found = _sequence(statement, failed, best, ready, reporter) if can_be_loosened(statement) else None
+    mesh = failed.extremal.mesh if mesh is None else mesh
+    most = part(reporter, MOST_ITERATIONS, best, floor=mesh.step == "rk4" and bounded_below(statement))
+    found = _sequence(statement, failed, best, mesh, ready, most) if can_be_loosened(statement) else None
     if found is None:
         return failed
+    if not (found.converged or reporter.stop):  # its own limit
+        return with_stats(failed, **counted(failed, found))
     chosen = found if found.converged else min(failed, found, key=rank)
     return with_stats(chosen, **counted(failed, found))
 
 
 def _sequence(
-    statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress
+    statement: Statement, failed: Outcome, best: Solution, mesh: Mesh, ready: Ready, reporter: Progress
 ) -> Outcome | None:
     """The outcome of the problem itself, or the best until a limit is reached; None where steps became too small."""
-    mesh, parameters = failed.extremal.mesh, failed.extremal.parameters
-    start = make_guess(statement, mesh, parameters, best)
+    parameters = failed.extremal.parameters
+    start = None if mesh.step == "rk4" else start_with_multipliers(statement, mesh, parameters, best)
+    start = make_guess(statement, mesh, parameters, best) if start is None else start
     room = {
         name: _missed(getattr(statement, name), name, start.trajectory, mesh, parameters) for name in ("path", "end")
     }

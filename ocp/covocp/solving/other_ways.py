@@ -18,10 +18,13 @@ from covocp.extremal.extremal import Outcome, Prepared
 from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, rank, with_stats
+from covocp.solving.from_best_gain import part
 from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 
+# Iterations with other steps: what finds a way by them mostly takes fewer, and each takes long.
+MOST_ITERATIONS = 150
 STEPS, HESSIAN = {"covariance_step": "gauss"}, {"hessian": "limited-memory"}
 
 
@@ -80,7 +83,8 @@ def by_other_ways(
         try:
             prepared = ready(way)
             start = make_guess(failed.extremal.statement, prepared.mesh, failed.extremal.parameters, near)
-            found = prepared.solve(failed.extremal.parameters, start, reporter)
+            most = part(reporter, MOST_ITERATIONS if way.mesh else None, near, floor=False)
+            found = prepared.solve(failed.extremal.parameters, start, most)
         except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved; another way may apply
             tried.append(way.words)
             continue

@@ -38,6 +38,7 @@ from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
 from covocp.solving.farther import in_larger_units
+from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
@@ -277,8 +278,14 @@ class Solver:
             self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
         if assess and guess is None and first is None:
             self._look_at_steps(values)
+        found = None
+        if isinstance(guess, Solution):
+            further = first is guess and self._by_ipopt
+            found = from_best(self._solved, self._prepared, values, guess, reporter, further=further)
+        if found is not None and found[2]:  # the optimum with the best gain: nobody looks for another one beside it
+            return found[0], first
         try:
-            outcome, start = self._from_start(values, guess, first, reporter)
+            outcome, start = found[:2] if found is not None else self._from_start(values, guess, first, reporter)
         except OutsideDomainError as error:
             if not isinstance(given, Later | Solution):
                 raise
@@ -306,8 +313,13 @@ class Solver:
             starts.insert(0, make_guesses(self._solved, self._prepared.mesh, values, coarse))
         if best is not None and guess is not best:
             starts.append(make_guesses(self._solved, self._prepared.mesh, values, best))
+        # what leads astray on such steps goes another way
+        watched_over = self._otherwise and self._prepared.mesh.step == "rk4" and bounded_below(self._solved)
         for several in starts:
-            outcome, start = from_starts(self._prepared, values, several, reporter)
+            most = part(reporter, None, best) if best is not None and watched_over else reporter
+            outcome, start = from_starts(self._prepared, values, several, most)
+            if most is not reporter and most.spent and not outcome.converged:
+                outcome = replace(outcome, message=f"stopped at {most.spent}")
             if outcome.converged or reporter.stop:
                 break
         if best is not None and self._otherwise and not outcome.converged and not reporter.stop:
@@ -393,9 +405,28 @@ class Solver:
         if outcome.converged or beyond(self._problem.declarations, best):  # which no way changes
             return outcome
         outcome, kept = by_other_ways(outcome, near, self._other_ways(), ready, reporter)
+        if kept is None and (way := next((way for way in self._other_ways() if way.mesh), None)):
+            outcome, kept = self._tightened_by(way, outcome, best, reporter)
         if kept is not None:
             self._keep_way(*kept)
         return outcome
+
+    def _tightened_by(
+        self, way: Way, failed: Outcome, best: Solution, reporter: Progress
+    ) -> tuple[Outcome, tuple[Way, Prepared] | None]:
+        """The outcome by loosened limits with the steps of another way, and that way made ready; else None."""
+        options, tried = replace(self._options, **way.mesh), failed.stats.get(OTHERWISE)
+
+        def loosened(statement: Statement, most: int) -> Prepared:
+            return self._ready(options, statement, max_iterations=most)
+
+        if reporter.stop:
+            return failed, None
+        prepared = self._ready(options)
+        outcome = tightened(self._solved, failed, best, loosened, reporter, prepared.mesh)
+        if not outcome.converged:
+            return (with_stats(outcome, **{OTHERWISE: tried}) if tried else outcome), None
+        return with_stats(outcome, **{OTHERWISE: way.words}), (way, prepared)
 
     def _other_ways(self) -> Iterator[Way]:
         """Those that are open."""
