@@ -291,8 +291,8 @@ class Solver:
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
-        given = (lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start)
-        outcome, prepared = in_larger_units(*given, first=not self._ran)
+        ran = (lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start)
+        outcome, prepared = in_larger_units(*ran, first=not self._ran)
         self._ran = True
         if prepared is not self._prepared:
             self._keep(self._options, prepared)

@@ -62,6 +62,8 @@ class _Rows:
     values: Array
     slopes: Array
 
+    __repr__ = short_repr
+
 
 def energy(run: Run, u: Array, flat: Array) -> float:
     """Of the controls, beside those without."""
