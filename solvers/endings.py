@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-# A run that a limit ends is judged by its residuals, as every run is.
-OF_ITERATIONS = "stopped at the largest number of iterations"
-MET_AT_LIMIT = f"{OF_ITERATIONS}, where what is left is no more than a solution may leave"
-
 
 class Ending(Enum):
     """The endings of a method are an enum of this kind."""

@@ -17,7 +17,7 @@ from covocp.base.residuals import VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
-from covocp.solvers.endings import MET_AT_LIMIT, OF_ITERATIONS, Ending
+from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
 from covocp.solvers.reached import (
@@ -309,9 +309,7 @@ class Runs:
         """How the run ended, a sentence."""
         status, known = last.point.status, self._ending(last.point.status)
         if last.converged:
-            if last.point.success:
-                return str(known or Status.SOLVED)
-            return MET_AT_LIMIT if known is not None and known.words == OF_ITERATIONS else str(Status.SOLVED)
+            return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
         if last.residuals is not None and last.point.success:
             return f"{STALE}: {last.residuals}; {REMEDY}"
         if not last.point.evaluable:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from covocp.solvers.endings import OF_ITERATIONS, Ending
+from covocp.solvers.endings import Ending
 
 
 class Status(Ending):
@@ -21,7 +21,7 @@ class Status(Ending):
     )
     ITERATIONS = (
         "Maximum_Iterations_Exceeded",
-        OF_ITERATIONS,
+        "stopped at the largest number of iterations",
         "start closer, or allow more (max_iterations=)",
     )
     RESTORATION = (
@@ -55,7 +55,7 @@ class Status(Ending):
     @property
     def judged(self) -> bool:
         """Whether the point may be stationary, although Ipopt does not say so."""
-        return self in (Status.ACCEPTABLE, Status.NO_PROGRESS, Status.NO_STEP, Status.ITERATIONS)
+        return self in (Status.ACCEPTABLE, Status.NO_PROGRESS, Status.NO_STEP)
 
 
 def status_of(name: str) -> Status | None:

@@ -19,6 +19,7 @@ from covocp.solvers.gradient.iterate import Space, make_space, point_of
 from covocp.solvers.gradient.lengths import lengths
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings
+from covocp.solvers.gradient.statuses import Status
 from covocp.statement.chain import Chain, Link
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
@@ -127,7 +128,7 @@ class GradientChainSolver:
             link_multipliers=space.link_multipliers(iterate, linear, measures),
             bounds_at_ends=tuple((np.zeros_like(last), last) for last in at_ends),
             cost_terms=tuple({"terminal": own.run.terminal, "running": own.run.running} for own in iterate.parts),
-            converged=end.status.solved,
+            converged=end.status is Status.SOLVED,
             message=end.status.told(misled),
             violations=judged.violations(iterate, self._settings.violation_tolerance),
             stats=counts,

@@ -49,6 +49,7 @@ from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.records import Iterate
 from covocp.solvers.gradient.search import End, Search, Settings, Variant
+from covocp.solvers.gradient.statuses import Status
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
@@ -314,7 +315,7 @@ class GradientSolver:
                 )
             ),
             cost_terms={"terminal": run.terminal, "running": run.running},
-            converged=end.status.solved,
+            converged=end.status is Status.SOLVED,
             message=end.status.told(misled),
             violations=space.violations(end.iterate, self._settings.violation_tolerance),
             stats=stats,

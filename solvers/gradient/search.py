@@ -119,8 +119,6 @@ class Search:
             self.passes += 1
             space = self.space = space.judged_at(current)
             worst = space.violation(current)
-            if end.status is Status.ITERATIONS and self._met(end, worst, limit):
-                return end._replace(status=Status.MET)
             if end.status is not Status.SOLVED or not space.groups:
                 return end
             tight = tolerance <= settings.tolerance and worst.max(initial=0.0) <= settings.violation_tolerance
@@ -135,14 +133,6 @@ class Search:
             current = space.at(current.point)
             self.control.past.clear()
             self.control.pairs.clear()
-
-    def _met(self, end: End, worst: Array, limit: float) -> bool:
-        """Whether the iterate at a limit leaves no more than a solution may, in the scale of this point."""
-        allowed = self.settings.violation_tolerance
-        if end.measures.miss > TERMINAL_SHARE * allowed or not worst.max(initial=0.0) <= allowed:
-            return False
-        linear = self.space.linearise(end.iterate)
-        return linear.finite and self.space.reached(end.iterate, linear, end.measures).hold(limit)
 
     def _pass(self, current: Iterate, tolerance: float) -> End:
         """Gradient steps for the present penalties."""

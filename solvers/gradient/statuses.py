@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from covocp.solvers.endings import MET_AT_LIMIT, OF_ITERATIONS, Ending
+from covocp.solvers.endings import Ending
 
 RAISE_WEIGHT = "raise the weight, or weight_factor"
 
@@ -12,8 +12,7 @@ class Status(Ending):
 
     SOLVED = ("solved", "")
     STOPPED = ("interrupted by the user", "")
-    ITERATIONS = (OF_ITERATIONS, "start closer, or allow more")
-    MET = (MET_AT_LIMIT, "")
+    ITERATIONS = ("stopped at the largest number of iterations", "start closer, or allow more")
     UNMET = ("the terminal conditions do not come closer", "the bounds may forbid them, or start elsewhere")
     UNMET_BY_FIXED_WEIGHT = ("the terminal conditions do not come closer", RAISE_WEIGHT)
     DIVERGING = ("the steps diverge", RAISE_WEIGHT)
@@ -31,12 +30,7 @@ class Status(Ending):
         """Keep the parts of the value by name."""
         self.words, self.advice = words, advice
 
-    @property
-    def solved(self) -> bool:
-        """Whether the last iterate is a solution."""
-        return self in (Status.SOLVED, Status.MET)
-
     def told(self, misled: str) -> str:
         """In words; of a run that failed with steps that are too long these, `misled`, are the reason."""
-        by_itself = self in (Status.SOLVED, Status.MET, Status.STOPPED, Status.ITERATIONS)
+        by_itself = self in (Status.SOLVED, Status.STOPPED, Status.ITERATIONS)
         return misled if misled and not by_itself else str(self)

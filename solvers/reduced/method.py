@@ -155,14 +155,15 @@ class ReducedRuns(Runs):
         self._unit = None
 
     def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
-        """A unit of the cost in which its curvature is of the order of one: what is learnt of it, and what is compared.
+        """A unit of the cost in which it and its slopes are of the order of one: what is learnt, and what is compared.
 
         The same for all runs of a program, whose Hessian is kept; a power of two, which rounds nothing.
         """
         if self._unit is None:
-            with np.errstate(all="ignore"):
-                size = self._curvature_along(self._first_order(), w0, parameters)
-            self._unit = float(np.exp2(np.rint(np.log2(size)))) if size > 0.0 and np.isfinite(size) else 1.0
+            assert self._nlp is not None
+            value, slope = self._first_order().cost(w0, parameters)
+            size = max(abs(value), float(np.abs(slope[self._nlp.chosen]).max(initial=0.0)))
+            self._unit = float(np.exp2(np.rint(np.log2(size)))) if 0.0 < size < np.inf else 1.0
         return self._unit
 
     def _ending(self, name: str) -> Ending | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from covocp.solvers.endings import OF_ITERATIONS, Ending
+from covocp.solvers.endings import Ending
 
 
 class Status(Ending):
@@ -10,7 +10,7 @@ class Status(Ending):
 
     SOLVED = ("solved", "")
     STOPPED = ("interrupted by the user", "")
-    ITERATIONS = (OF_ITERATIONS, "start closer, or allow more (max_iterations=)")
+    ITERATIONS = ("stopped at the largest number of iterations", "start closer, or allow more (max_iterations=)")
     INFEASIBLE = ("no step brings the constraints closer", "they may contradict, or start elsewhere")
     NO_PROGRESS = ("no further progress is possible at this accuracy", "method='ipopt' may find a way")
     NO_NUMBER = ("the model became NaN or inf", "add bounds that keep it in its domain")
@@ -31,4 +31,4 @@ class Status(Ending):
     @property
     def judged(self) -> bool:
         """Whether the point may be stationary, although the run does not say so."""
-        return self in (Status.NO_PROGRESS, Status.ITERATIONS)
+        return self is Status.NO_PROGRESS

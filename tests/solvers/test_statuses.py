@@ -43,13 +43,3 @@ def test_endings_of_the_gradient_method_say_what_to_do(ending, options):
     with pytest.raises(co.SolveError, match=f"{ending.words}: {ending.advice}") as told:
         co.solve(ocp, "gradient", intervals=20, progress=False, **options)
     assert told.value.solution.stats["return_status"] == str(ending)
-
-
-@pytest.mark.parametrize(("method", "most"), [("ipopt", 12), ("reduced", 13), ("gradient", 14)])
-def test_a_run_that_a_limit_ends_is_judged_by_what_it_leaves(method, most):
-    """One iteration before its own tolerance is met; the cost is that of a run to the end."""
-    options = {"intervals": 20, "progress": False}
-    found = co.solve(unknown_lag.problem(final=1.0), method, max_iterations=most, **options)
-    assert found.stats["iterations"] == most
-    assert "largest number of iterations, where what is left is no more than a solution may leave" in found.status
-    assert found.cost == pytest.approx(co.solve(unknown_lag.problem(final=1.0), method, **options).cost, rel=1e-8)

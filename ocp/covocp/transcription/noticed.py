@@ -73,7 +73,7 @@ def noticed_units(run: Run, flat: Array, units: Array, untold: NDArray[np.bool_]
         units: of the controls, (nu,).
         untold: controls of which nothing tells a size, (nu,).
     """
-    result = units.copy()
+    result, run = units.copy(), _in_pairs(run)
     with np.errstate(all="ignore"):
         cost = merit(run, flat)[0]
         for i in np.flatnonzero(untold).tolist() if np.isfinite(cost) else ():
@@ -99,6 +99,7 @@ def further(
         untold: controls of which nothing tells a size, (nu,).
         free: units of entries of the initial state that are free, of which nothing tells a size.
     """
+    run = _in_pairs(run)
     with np.errstate(all="ignore"):
         cost, violation = merit(run, u)
         if not abs(cost - known) <= SAME * abs(known):
@@ -116,6 +117,12 @@ def further(
     if found[0] < cost - GAINED * abs(cost) and found[1] <= max(violation, MISSED):
         return Moved(u=moved, start=_started(run, start).start)
     return None
+
+
+def _in_pairs(run: Run) -> Run:
+    """The run with an even number of substeps, where a cost of matrices is integrated by Simpson's rule."""
+    odd = run.statement.running_uses_matrices and run.mesh.substeps % 2
+    return replace(run, mesh=replace(run.mesh, substeps=2 * run.mesh.substeps)) if odd else run
 
 
 def _along(run: Run, u: Array, i: int) -> Callable[[float], float]:
