@@ -38,6 +38,8 @@ TOLERANCE = 3e-7
 LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
 # Control values from which on a dense Hessian is no longer the way.
 MOST_CONTROLS = 2000
+# Costs and slopes that are more than so many times more or less than one have a unit of their own.
+FAR_COST = 1e4
 
 
 @checked("the method 'reduced'", tolerance=positive, max_iterations=whole(0))
@@ -155,14 +157,18 @@ class ReducedRuns(Runs):
         self._unit = None
 
     def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
-        """A unit of the cost in which it and its slopes are of the order of one: what is learnt, and what is compared.
+        """A unit of the cost in which its curvature is of the order of one: what is learnt of it, and what is compared.
 
-        The same for all runs of a program, whose Hessian is kept; a power of two, which rounds nothing.
+        One, where the cost and its slopes are not far from that. The same for all runs of a program, whose Hessian is
+        kept; a power of two, which rounds nothing.
         """
         if self._unit is None:
             assert self._nlp is not None
-            value, slope = self._first_order().cost(w0, parameters)
-            size = max(abs(value), float(np.abs(slope[self._nlp.chosen]).max(initial=0.0)))
+            with np.errstate(all="ignore"):
+                value, slope = self._first_order().cost(w0, parameters)
+                size = max(abs(value), float(np.abs(slope[self._nlp.chosen]).max(initial=0.0)))
+                near = 1.0 / FAR_COST <= size <= FAR_COST
+                size = 1.0 if near else self._curvature_along(self._first_order(), w0, parameters)
             self._unit = float(np.exp2(np.rint(np.log2(size)))) if 0.0 < size < np.inf else 1.0
         return self._unit
 
