@@ -13,10 +13,12 @@ from functools import lru_cache
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.pieces import may_repeat
 from covocp.extremal.dense_output import mapped
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Trajectory
 
@@ -45,7 +47,16 @@ def changes_within_steps(extremal: Extremal) -> bool:
     Args:
         extremal: a trajectory.
     """
-    return _changes(extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()))
+    st = extremal.statement
+    if st.autonomous and not _repeats(st):
+        return False
+    return _changes(st, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()))
+
+
+@lru_cache(maxsize=KEPT)
+def _repeats(statement: Statement) -> bool:
+    """Whether something in the model may repeat itself as states and controls move."""
+    return may_repeat(statement.rates)
 
 
 @lru_cache(maxsize=4)
