@@ -29,7 +29,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.free_starts import free_start, largest, start_weights
 from covocp.extremal.hamiltonian import Costates
-from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, second_order
+from covocp.extremal.lagrangian import arguments, node_size, second_order, slopes_of_intervals
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
 
@@ -437,7 +437,7 @@ def _between(extremal: Extremal, fine: Extremal) -> Between:
     if extremal.mesh.points == 1:
         none = np.zeros((extremal.mesh.intervals, 1, 0, 0))  # there is nothing to pass through
         return Between(A=none, before=none, after=none, constant=constant)
-    slopes = interval_slopes(fine)
+    slopes = slopes_of_intervals(fine)
     if constant:
         slopes = (slopes[0], slopes[1] + slopes[2], np.zeros_like(slopes[2]))
     A, before, after = (v.reshape(extremal.mesh.intervals, extremal.mesh.points, *v.shape[1:]) for v in slopes)
@@ -449,7 +449,7 @@ def tangents_along(
 ) -> Tangents:
     """The linearised nominal along an extremal, as a map from the controls that are free and the initial states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    A, before, after = interval_slopes(extremal)
+    A, before, after = slopes_of_intervals(extremal)
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
     scales = (largest(z), largest(t.u))
     constant = mesh.control == "constant"

@@ -19,11 +19,10 @@ from covocp.extremal.hamiltonian import Costates
 from covocp.passage.sweep import passed_by
 from covocp.statement.conditions import Columns, Conditions, Inside
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
 from covocp.transcription.staged import interval_transitions, is_staged
-from covocp.transcription.steps import full_interval, moving_interval, nominal_interval
+from covocp.transcription.steps import full_interval, interval_slopes, nominal_interval
 
 # Rows that hold states alone.
 OF_STATES = ("final", "states")
@@ -127,17 +126,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     return ca.Function("product", [*inputs, direction], [product]), ca.Function("held", inputs, [jacobian])
 
 
-@lru_cache(maxsize=KEPT)
-def _interval_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
-    """(nodes, controls, T, parameters) -> slopes of the ends of the intervals, (n, N n), (n, N nu), (n, N nu)."""
-    step = moving_interval(statement, mesh.substeps, mesh.step)
-    symbols = step.mx_in()
-    end = step(*symbols)[0]
-    slopes = [ca.densify(ca.jacobian(end, symbols[i])) for i in range(3)]
-    return ca.Function("slopes", symbols, slopes).map(mesh.intervals)
-
-
-def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
+def slopes_of_intervals(extremal: Extremal) -> tuple[Array, Array, Array]:
     """Slopes of the node after each interval by the node before it and by the controls at its two ends.
 
     Returns:
@@ -148,6 +137,6 @@ def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
     common = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
     if is_staged(st, mesh):
         return interval_transitions(st, mesh, z[:-1].T, common)
-    values = _interval_slopes(st, mesh)(z[:-1].T, *common)
+    values = interval_slopes(st, mesh.substeps, mesh.step).map(mesh.intervals)(z[:-1].T, *common)
     A, first, last = (stacked(v, mesh.intervals) for v in values)
     return A, first, last

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,14 +12,13 @@ from numpy.typing import NDArray
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.conditions import beyond
-from covocp.statement.interval import Interval, model_symbols, repeated
+from covocp.statement.interval import model_symbols, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
-from covocp.transcription.mesh import Mesh
 from covocp.transcription.ranking import matrices_of_run
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steering import Run
-from covocp.transcription.steps import nominal_interval
+from covocp.transcription.steps import interval_slopes
 from covocp.transcription.trajectory import at_nodes
 
 # Share of the largest value of a condition along a run, and of its limits, up to which it counts as met.
@@ -109,7 +107,8 @@ def slopes_along(along: Course) -> tuple[Array, Array]:
     count, nu, n = x.shape[0], st.nu, along.u.size
     mesh = run.mesh
     columns = interval_columns(mesh, ca.DM(along.u.T), run.duration, ca.DM(run.parameters))
-    parts = [np.asarray(v.full()) for v in _interval_slopes(st, mesh)(x[:-1].T, *columns)]
+    of_intervals = interval_slopes(st, mesh.substeps, mesh.step).map(mesh.intervals)
+    parts = [np.asarray(v.full()) for v in of_intervals(x[:-1].T, *columns)]
     moved, first, second = (v.reshape(st.nx, count - 1, -1).swapaxes(0, 1) for v in parts)
     linear = mesh.control == "linear"
     states = np.zeros((count, st.nx, n))
@@ -190,15 +189,3 @@ def _row_slopes(statement: Statement) -> ca.Function:
     symbols = model_symbols(statement)
     values = statement.path.function(*symbols)
     return ca.Function("row_slopes", symbols, [ca.densify(ca.jacobian(values, symbols[i])) for i in (0, 1)])
-
-
-@lru_cache(maxsize=KEPT)
-def _interval_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
-    """(states, intervals), a column each -> slopes of their ends by the state and by the controls at both ends."""
-    interval = nominal_interval(statement, mesh.substeps, mesh.step)
-    kind: Any = ca.MX if mesh.step == "rodas" else statement.symbolic
-    x, columns = kind.sym("x", statement.nx), Interval.symbols(statement, kind)
-    end = interval(x, *columns)[0]
-    by = (x, columns.start, columns.end)
-    own = ca.Function("interval_slopes", [x, *columns], [ca.densify(ca.jacobian(end, v)) for v in by])
-    return own.map(mesh.intervals)

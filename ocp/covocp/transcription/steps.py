@@ -225,6 +225,20 @@ def moving_interval(statement: Statement, substeps: int, step: StepKind) -> ca.F
     return (full_interval if statement.coupled else nominal_interval)(statement, substeps, step)
 
 
+@lru_cache(maxsize=KEPT)
+def interval_slopes(statement: Statement, substeps: int, step: StepKind) -> ca.Function:
+    """Slopes of the end of an interval of what moves along it, dense.
+
+    Returns:
+        The arguments of `moving_interval` -> slopes by its start (n, n), by the controls at both ends (n, nu) each.
+    """
+    interval = moving_interval(statement, substeps, step)
+    symbols = interval.mx_in()
+    end = interval(*symbols)[0]
+    slopes = [ca.densify(ca.jacobian(end, symbols[i])) for i in range(3)]
+    return ca.Function("interval_slopes", symbols, slopes)
+
+
 def full_interval(statement: Statement, substeps: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 
