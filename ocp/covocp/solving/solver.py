@@ -40,11 +40,12 @@ from covocp.solving.failure import failure
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
-from covocp.solving.loosened import PATIENCE, tightened
+from covocp.solving.gain_ways import by_any_way
+from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
-from covocp.solving.other_ways import Way, by_other_ways, other_ways, told_ways
+from covocp.solving.other_ways import Way, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
@@ -394,39 +395,11 @@ class Solver:
 
         The way that finds a solution is that of later runs.
         """
-
-        def loosened(statement: Statement, most: int) -> Prepared:
-            return self._ready(self._options, statement, max_iterations=most)
-
-        def ready(way: Way) -> Prepared:
-            return self._ready(replace(self._options, **way.mesh), by=way.method, **way.own)
-
-        outcome = tightened(self._solved, failed, best, loosened, reporter)
-        if outcome.converged or beyond(self._problem.declarations, best):  # which no way changes
-            return outcome
-        outcome, kept = by_other_ways(outcome, near, self._other_ways(), ready, reporter)
-        if kept is None and (way := next((way for way in self._other_ways() if way.mesh), None)):
-            outcome, kept = self._tightened_by(way, outcome, best, reporter)
+        given = (self._solved, self._options, self._ready, self._other_ways, failed, (best, near), reporter)
+        outcome, kept = by_any_way(*given, further=not beyond(self._problem.declarations, best))
         if kept is not None:
             self._keep_way(*kept)
         return outcome
-
-    def _tightened_by(
-        self, way: Way, failed: Outcome, best: Solution, reporter: Progress
-    ) -> tuple[Outcome, tuple[Way, Prepared] | None]:
-        """The outcome by loosened limits with the steps of another way, and that way made ready; else None."""
-        options, tried = replace(self._options, **way.mesh), failed.stats.get(OTHERWISE)
-
-        def loosened(statement: Statement, most: int) -> Prepared:
-            return self._ready(options, statement, max_iterations=most)
-
-        if reporter.stop:
-            return failed, None
-        prepared = self._ready(options)
-        outcome = tightened(self._solved, failed, best, loosened, reporter, prepared.mesh)
-        if not outcome.converged:
-            return (with_stats(outcome, **{OTHERWISE: tried}) if tried else outcome), None
-        return with_stats(outcome, **{OTHERWISE: way.words}), (way, prepared)
 
     def _other_ways(self) -> Iterator[Way]:
         """Those that are open."""
