@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import covocp as co
-from covocp.solving import solver
+from covocp.solving import gain_ways, solver
 from covocp.solving.loosened import PATIENCE_OF_STEPS
 
 
@@ -88,7 +88,7 @@ def test_at_a_limit_inside_a_loosened_run_the_best_point_counts(monkeypatch):
 def test_a_solution_under_wider_limits_is_not_one_of_the_problem(monkeypatch):
     """Where the user interrupts after it, and the first run ended worse: it is told with what it violates."""
     monkeypatch.setattr(solver, "PATIENCE", 2)
-    made_ready, tightened = solver.made_ready, solver.tightened
+    made_ready, tightened = solver.made_ready, gain_ways.tightened
     reached = []
 
     class Last:
@@ -109,7 +109,7 @@ def test_a_solution_under_wider_limits_is_not_one_of_the_problem(monkeypatch):
         return tightened(statement, replace(failed, violations={"speed": np.inf}), *rest)
 
     monkeypatch.setattr(solver, "made_ready", ready)
-    monkeypatch.setattr(solver, "tightened", after_worse)
+    monkeypatch.setattr(gain_ways, "tightened", after_worse)
     with pytest.raises(co.Interrupted) as told:
         co.solve(brisk(), intervals=30, progress=False)
     found = told.value.solution
