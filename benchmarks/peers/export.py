@@ -79,7 +79,7 @@ def theta_d_functions() -> list[ca.Function]:
 
 def peak_seeking_functions() -> list[ca.Function]:
     """Update and step of the formation flight."""
-    law = peak_seeking.seeker(2, **formation_flight.RECOMMENDED)
+    law = peak_seeking.seeker(2, **peak_seeking.with_changes(formation_flight.RECOMMENDED, {}))
     return [law.update, law.step]
 
 
