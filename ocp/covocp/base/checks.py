@@ -280,12 +280,15 @@ def _indefinite(numbers: Array, definite: bool) -> str:
     """What keeps a finite density or variance from being symmetric and positive (semi)definite; "" where nothing."""
     if not numbers.size:
         return ""
+    diagonal = np.diagonal(numbers)
+    alone = np.count_nonzero(numbers) == np.count_nonzero(diagonal)
+    if alone and (diagonal > 0 if definite else diagonal >= 0).all():
+        return ""
     scaled = over_units(numbers, own_units(numbers, negative=True))  # entries 10^18 apart say nothing of each other
     if not np.allclose(scaled, scaled.T, rtol=1e-9, atol=1e-12):
         return "is not symmetric"
     values, scalar = np.linalg.eigvalsh(scaled), numbers.size == 1
     largest = float(np.abs(values).max())
-    alone = not np.count_nonzero(numbers - np.diag(np.diag(numbers)))
     plain = float(np.linalg.eigvalsh(numbers)[0])
     told = f"(smallest eigenvalue {plain:.6g})"
     if np.sign(plain) != np.sign(values[0]):  # rounding of the largest one

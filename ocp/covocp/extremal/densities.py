@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.checks import check_density
 from covocp.base.errors import ProblemError
@@ -247,7 +248,7 @@ def _largest(extremal: Extremal, slopes: Array, nodes: Any) -> Array:
 def first_impossible(noises: Iterator[Noise] | Sequence[Noise]) -> Impossible | None:
     """What is wrong with the first noise that none can be; else None."""
     for noise in noises:
-        for rows in _together(noise.matrices):
+        for rows in _together(noise):
             own = noise.matrices[:, rows][:, :, rows]
             wrong = _first_wrong(own, noise, rows)
             if wrong is None:
@@ -264,12 +265,23 @@ def first_impossible(noises: Iterator[Noise] | Sequence[Noise]) -> Impossible | 
     return None
 
 
-def _together(matrices: Array) -> list[list[int]]:
-    """Rows that are alone, one by one, then those with an entry beside the diagonal at some point."""
-    size = matrices.shape[1]
-    beside = ((matrices != 0.0) & ~np.eye(size, dtype=bool)).any(axis=(0, 2))
+def _together(noise: Noise) -> list[list[int]]:
+    """Rows that are alone and may be no variance, one by one, then those with entries beside the diagonal."""
+    size = noise.matrices.shape[1]
+    beside = ((noise.matrices != 0.0) & ~np.eye(size, dtype=bool)).any(axis=(0, 2))
     joined = np.flatnonzero(beside).tolist()
-    return [*([i] for i in range(size) if not beside[i]), *([joined] if joined else [])]
+    alone = np.flatnonzero(~beside & ~_plainly(noise)).tolist()
+    return [*([i] for i in alone), *([joined] if joined else [])]
+
+
+def _plainly(noise: Noise) -> NDArray[np.bool_]:
+    """Rows whose variances are numbers that are large enough at all points, of which no more has to be asked."""
+    variances = np.diagonal(noise.matrices, axis1=1, axis2=2)
+    if not noise.definite:
+        return np.asarray(((variances >= 0.0) & (variances < np.inf)).all(axis=0))
+    largest = np.max(variances, axis=0, initial=0.0)
+    least = SINGULAR * (largest if noise.beside is None else np.minimum(largest, noise.beside))
+    return np.asarray(((variances >= least) & (variances > 0.0) & (variances < np.inf)).all(axis=0))
 
 
 def _first_wrong(matrices: Array, noise: Noise, rows: list[int]) -> tuple[int, float, int] | None:
