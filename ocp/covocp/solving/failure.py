@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,6 +38,13 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         solution=solution,
         violations=outcome.violations,
     )
+
+
+def possible(outcome: Outcome) -> tuple[Outcome, bool]:
+    """An outcome, not converged where a noise along it is none, and whether that is so."""
+    found = impossible_density(outcome.extremal) if outcome.converged else ""
+    message = f"the solution found means nothing: {found}"
+    return (replace(outcome, converged=False, message=message) if found else outcome), bool(found)
 
 
 def impossible_noises(extremals: Sequence[Extremal], said: str) -> str:

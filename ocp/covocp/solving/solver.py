@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
-from covocp.base.errors import CovocpError, Interrupted, OutsideDomainError, evaluating
+from covocp.base.errors import OutsideDomainError, evaluating
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time
-from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
@@ -33,10 +32,11 @@ from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Costs
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
+from covocp.solving.continued import again_on, continued
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
-from covocp.solving.failure import failure
+from covocp.solving.failure import failure, possible
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
@@ -51,7 +51,7 @@ from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
 from covocp.solving.suited_mesh import Beginning, beginning, other_nodes, suits
 from covocp.solving.unused import mention_clock, mention_forgotten, mention_lengths
-from covocp.solving.warm_start import Later, make_guess, make_guesses
+from covocp.solving.warm_start import Later, make_guesses
 from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
@@ -429,19 +429,8 @@ class Solver:
     def _continued(self, values: Array, solution: Solution) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
-        try:
-            prepared = self._ready(self._options, tolerance=CONTINUED * tolerance)
-            with Progress("", show=False) as reporter:
-                start = make_guess(self._solved, prepared.mesh, values, solution)
-                outcome = prepared.solve(values, start, reporter)
-        except (CovocpError, RuntimeError):  # a plugin that has no tolerance; CasADi's, of a step that cannot be solved
-            return solution
-        if reporter.stop:
-            message = "Interrupted while the solution was made more exact. On this error (.solution): a solution."
-            raise Interrupted(message, solution=solution)
-        if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
-            return solution
-        return with_stats(Solution.of(outcome, self._by), **{**solution.stats, **counted(solution, outcome)})
+        again = partial(self._ready, self._options, tolerance=CONTINUED * tolerance)
+        return continued(again, self._solved, values, solution, self._by)
 
     def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
@@ -471,24 +460,15 @@ class Solver:
         self._classical = self._classical_design()
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs.
-
-        What the longer steps do not see may make a saddle of where they end.
-        """
+        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
             finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
             if finer is None:
                 break
-            try:
-                prepared = self._ready(finer)
-                coarse = Solution.of(outcome, self._by, assess=False)
-                start = make_guess(self._solved, prepared.mesh, values, coarse)
-                again = prepared.solve(values, start, reporter)
-            except (CovocpError, RuntimeError):  # what the steps are off is told with the solution that there is
+            found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
+            if found is None:
                 break
-            if not again.converged:
-                break
-            again = away_from_saddle(prepared, again, values, reporter, start)
+            again, prepared = found
             outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
             self._keep(finer, prepared)
         return outcome
@@ -505,16 +485,12 @@ class Solver:
 
     def _finish(self, outcome: Outcome, best: Solution | None, *, allow_failure: bool, assess: bool) -> Solution:
         """An outcome, perhaps of a run from the best gain, as a solution, with what the user must know about it."""
-        impossible = impossible_density(outcome.extremal) if outcome.converged else ""
-        if impossible:
-            outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(with_stats(outcome, **self._options.grading), self._by, assess=assess)
-        if not outcome.converged:
-            if allow_failure:
-                return solution
-            other_way = "" if impossible else self._other_way(outcome, best)
-            raise failure(self.statement.name, self.method, outcome, solution, other_way)
-        if assess:
+        told, impossible = possible(outcome)
+        solution = Solution.of(with_stats(told, **self._options.grading), self._by, assess=assess)
+        if not told.converged and not allow_failure:
+            other_way = "" if impossible else self._other_way(told, best)
+            raise failure(self.statement.name, self.method, told, solution, other_way)
+        if told.converged and assess:
             mention_doubts(solution)
             mention_limits(solution)
         return solution
