@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from lag_variants import lag, variant
 from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, eigh, null_space
 
@@ -20,18 +21,11 @@ from covocp.analysis.mesh_bound import both_ends, divided, mesh_residual
 from covocp.analysis.reduction import Reduction
 from covocp.analysis.stages import Stages
 from covocp.base.matrices import unpack
-from covocp.models import damped_oscillator, mass_chain, unknown_lag
+from covocp.models import damped_oscillator, unknown_lag
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers
 
 EIGENVALUE = 0.43495704  # specification, 6.4: of the information operator on controls with x(T) = 0, T = 10
-SECOND = {"u": lambda s: -np.sin(2 * np.pi * s)}  # leads to the second local minimum of 5.3
-
-
-@lru_cache
-def lag(weight: float, final: float, *, second: bool = False, **options: Any) -> co.Solution:
-    problem = unknown_lag.problem(weight=weight, final=final)
-    return co.solve(problem, intervals=80, progress=False, guess=SECOND if second else None, **options)
 
 
 @lru_cache
@@ -43,43 +37,6 @@ def oscillator(naming: str, damping_weight: float, stiffness_weight: float) -> c
 @lru_cache
 def certificate_of(solution: co.Solution) -> co.Certificate:
     return co.certify(solution)
-
-
-def variant(
-    *,
-    duration: Any = 10.0,
-    start: Any = 0.0,
-    final: Any = 1.0,
-    unknown: bool = True,
-    covariance: bool = True,
-    initial: Any = None,
-    variance: float = 5.0,
-    state: dict[str, Any] | None = None,
-    control: dict[str, Any] | None = None,
-    rate: Any = lambda x, b, u, t: -b * x + u,
-    noise: Any = lambda x, u: 1.0,
-    measure: Any = lambda x, b, u, t: x,
-    measured: bool = True,
-    density: Any = lambda x, u: 1.0,
-    running: Any = lambda x, u, E, b: 0.5 * u**2,
-    terminal: Any = lambda x, E, b: 10.0 * E[b, b],
-    extra: Any = lambda ocp, x, u, E, b: None,
-) -> co.Problem:
-    """The first-order lag of 5.3 with one thing changed."""
-    ocp = co.Problem(duration, name="variant")
-    x = ocp.state("x", initial=start, final=final, variance=1.0, **(state or {}))
-    if unknown:
-        b: Any = ocp.unknown("b", mean=1.0, variance=variance)
-    else:
-        b = ocp.parameter("b", 1.0)
-    u = ocp.control("u", guess=lambda s: np.sin(np.pi * s), **(control or {}))
-    ocp.dynamics(x, rate(x, b, u, ocp.time), noise=noise(x, u))
-    if measured:
-        ocp.measurement("position", measure(x, b, u, ocp.time), noise=density(x, u))
-    E: Any = ocp.estimation_covariance(initial=initial) if covariance else None
-    extra(ocp, x, u, E, b)
-    ocp.minimize(running=running(x, u, E, b), terminal=terminal(x, E, b))
-    return ocp
 
 
 def two_parameters() -> co.Problem:
@@ -454,81 +411,6 @@ def test_what_violates_the_constraints_of_the_problem_is_not_certified() -> None
         assert "violates" in certificate.reason
 
 
-def in_units(cost: float, state: float, control: float, second: float, **limits: Any) -> co.Problem:
-    """The first-order lag to x(T) = 1 with other units of cost, state, control and time."""
-    ocp = co.Problem(10.0 * second, name="lag in other units")
-    x = ocp.state("x", initial=0.0, final=state, variance=state**2)
-    b = ocp.unknown("b", mean=1.0 / second, variance=5.0 / second**2)
-    u = ocp.control("u", **limits)
-    ocp.dynamics(x, -b * x + u * state / (control * second), noise=state**2 / second)
-    ocp.measurement("position", x, noise=state**2 * second)
-    E: Any = ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * cost / second * (u / control) ** 2, terminal=10.0 * cost * second**2 * E[b, b])
-    return ocp
-
-
-@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0, 1.0), (1e-13, 1.0, 1.0, 1.0), (1e-6, 1e-9, 1e-7, 1e3)])
-def test_no_unit_decides_what_is_certified(units: tuple[float, float, float, float]) -> None:
-    """A tolerance in the unit of the cost certified three times the least cost, where that is 1e-13."""
-    ocp = in_units(*units)
-    better, worse = (
-        co.certify(co.evaluate(ocp, nominal={"u": units[2] * found.trajectory.u}, intervals=80))
-        for found in (lag(10.0, 1.0), lag(10.0, 1.0, second=True))
-    )
-    assert better.certified, str(better)
-    assert better.stationarity < 1e-2
-    assert worse.verdict == "not certified"
-    # Exactly 7.71199239 - 7.08523968 in the unit of the cost, at least.
-    assert worse.gap > 0.6267 * units[0]
-
-
-def test_a_limit_in_a_small_unit_is_violated_by_a_share_of_it() -> None:
-    """Twice the limit, which is far below 1."""
-    best = lag(10.0, 1.0).trajectory.u
-    for size in (1.0, 1e-8):
-        ocp = in_units(1.0, 1.0, size, 1.0, upper=0.5 * size * best.max())
-        certificate = co.certify(co.evaluate(ocp, nominal={"u": size * best}, intervals=80))
-        assert certificate.verdict == "not certified"
-        assert "violates the constraints of the problem" in certificate.reason
-
-
-def with_unwanted_actuator(kind: str, size: float = 1.0) -> co.Problem:
-    """The lag and a control in some unit, which moves nothing or another state and is best at its limit of zero."""
-    ocp = co.Problem(10.0, name="lag with two controls")
-    x = ocp.state("x", initial=0.0, final=1.0, variance=1.0)
-    y = ocp.state("y", initial=0.0) if kind == "state" else None
-    b = ocp.unknown("b", mean=1.0, variance=5.0)
-    u, v = ocp.control("u"), ocp.control("v", lower=-np.inf if kind == "condition" else 0.0)
-    ocp.dynamics(x, -b * x + u, noise=1.0)
-    if y is not None:
-        ocp.dynamics(y, -y + v / size)
-    if kind == "condition":
-        ocp.subject_to(v, lower=0.0, name="pos")
-    ocp.measurement("position", x, noise=1.0)
-    E: Any = ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * u**2 + 0.5 * (v / size + 0.1) ** 2, terminal=10.0 * E[b, b])
-    return ocp
-
-
-@pytest.mark.parametrize("kind", ["condition", "bound", "state"])
-@pytest.mark.parametrize("method", ["ipopt", "reduced"])
-@pytest.mark.filterwarnings("ignore:At points where it is imposed the limit of")  # by 1e-8, or by 1e-34
-def test_a_limit_of_zero_that_is_met_up_to_the_solver_s_tolerance_is_met(kind: str, method: Any) -> None:
-    """What is left there is 1e-8 of the unit of the control, or rounding of nothing."""
-    solution = co.solve(with_unwanted_actuator(kind), intervals=20, method=method, progress=False)
-    assert "violates" not in str(co.certify(solution))
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-9])
-def test_a_limit_of_zero_is_violated_by_a_share_of_the_unit_of_the_control(size: float) -> None:
-    """The control costs by itself as much as the solution where it is 1.2 of its unit all the time."""
-    best = lag(10.0, 1.0).trajectory.u[:, 0]
-    for kind, share, violates in (("condition", 1e-4, True), ("bound", 1e-4, True), ("bound", 1e-8, False)):
-        nominal = {"u": best, "v": -share * size * np.ones(best.size)}
-        found = co.certify(co.evaluate(with_unwanted_actuator(kind, size), nominal=nominal, intervals=80))
-        assert ("violates" in str(found)) == violates
-
-
 def test_certifying_takes_time_in_proportion_to_the_intervals() -> None:
     """Operations are counted by what is stored: nothing has two axes of control values."""
     st = unknown_lag.problem().statement()
@@ -562,108 +444,3 @@ def test_printout_is_a_sentence() -> None:
     assert "smallest eigenvalue 0.0542" in text
     assert "\n" not in text
     assert str(certificate_of(lag(10.0, 1.0, second=True))).startswith("not certified: ")
-
-
-def symmetric(ocp: co.Problem, x: Any, u: Any, E: Any, b: Any) -> None:
-    ocp.dynamics(ocp.symmetric("Y", 1, initial=1.0), -u)
-
-
-REFUSED = {
-    "no estimation covariance": {"covariance": False, "terminal": lambda x, E, b: x**2},
-    "no unknown parameters": {"unknown": False, "terminal": lambda x, E, b: x**2},
-    "matrix states beside the estimation covariance: Y": {"extra": symmetric},
-    "nothing is measured": {"measured": False},
-    "the duration is free": {"duration": co.Free(10.0)},
-    "the initial state is free": {"start": None},
-    "correlated at the start": {"initial": np.array([[1.0, 0.5], [0.5, 5.0]])},
-    "parameters is singular": {"variance": 0.0},
-    "the rate of 'x' is not affine": {"rate": lambda x, b, u, t: -b * x - x**3 + u},
-    "slope of the rate of 'x' by the parameters": {"rate": lambda x, b, u, t: -x - (b - 1) * x**2 + u},
-    "the noise of 'x' depends": {"noise": lambda x, u: 1.0 + u**2},
-    "slope of measurement 'position' by the state": {"measure": lambda x, b, u, t: x**2},
-    "slope of measurement 'position' by the parameters": {"measure": lambda x, b, u, t: x + (b - 1) * u**2},
-    "the noise of measurement 'position' depends": {"density": lambda x, u: 1.0 + x**2},
-    "running cost depends on the covariance": {"running": lambda x, u, E, b: 0.5 * u**2 + E[b, b]},
-    "running cost has kinks": {"running": lambda x, u, E, b: 0.5 * u**2 - ca.fabs(x)},
-    "running cost has kinks or jumps": {"running": lambda x, u, E, b: 0.5 * u**2 + ca.if_else(x > 0, -x, 0.8 * x)},
-    "terminal cost has kinks": {"terminal": lambda x, E, b: E[b, b] - ca.floor(x)},
-    "the rate of 'x' is not affine in": {"rate": lambda x, b, u, t: -b * x + u + 0.1 * ca.floor(x)},
-    "running cost is not quadratic": {"running": lambda x, u, E, b: 0.5 * u**2 + u**4},
-    "not strictly convex in the control": {"running": lambda x, u, E, b: 0.5 * x**2},
-    "not linear in the covariance": {"terminal": lambda x, E, b: E[b, b] ** 2},
-    "terminal cost is not quadratic": {"terminal": lambda x, E, b: E[b, b] + x**4},
-    "entries of the covariance other than": {"terminal": lambda x, E, b: E[b, b] + E[x, x]},
-    "not positive semidefinite": {"terminal": lambda x, E, b: -E[b, b]},
-    "depend on the covariance (among 'accuracy')": {
-        "extra": lambda ocp, x, u, E, b: ocp.subject_to(E[b, b], upper=1.0, at="final", name="accuracy")
-    },
-    "not affine in state and control: 'disc'": {
-        "extra": lambda ocp, x, u, E, b: ocp.subject_to(x**2 + u**2, upper=9.0, name="disc")
-    },
-}
-
-
-@pytest.mark.parametrize(("reason", "changes"), REFUSED.items(), ids=REFUSED)
-def test_conditions_that_fail_are_named(reason: str, changes: dict[str, Any]) -> None:
-    statement = variant(**changes).statement()
-    assert reason in why_not(statement, statement.values)
-
-
-@pytest.mark.parametrize(("metres", "share"), [(1.0, 1.0), (1e7, 1e-6), (1e-7, 1e6)])
-def test_the_start_is_judged_by_correlations(metres: float, share: float) -> None:
-    """The same start in other units of state and parameter."""
-    units = np.outer([metres, share], [metres, share])
-    for correlation, reason in ((0.0, ""), (0.01, "correlated at the start"), (-0.9, "correlated at the start")):
-        initial = np.array([[1.0, correlation], [correlation, 1.0]]) * units
-        statement = variant(initial=initial).statement()
-        assert (reason in why_not(statement, statement.values)) if reason else not why_not(statement, statement.values)
-
-
-def test_a_cost_that_is_convex_in_the_control_at_round_times_only_is_refused() -> None:
-    ocp = co.Problem(5.0)
-    x = ocp.state("x", initial=0.0, variance=1.0)
-    b = ocp.unknown("b", mean=1.0, variance=0.5)
-    u = ocp.control("u")
-    ocp.dynamics(x, -b * x + u, noise=1.0)
-    ocp.measurement("position", x, noise=1.0)
-    E = ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * u**2 * (1 + 1.5 * ca.sin(2 * np.pi * 2 * ocp.time)), terminal=E[b, b])
-    st = ocp.statement()
-    assert "not strictly convex in the control (at t =" in why_not(st, st.values)
-
-
-def test_kinks_in_time_alone_are_allowed() -> None:
-    changes = {"rate": lambda x, b, u, t: -b * x + ca.if_else(t > 5.0, 1.0, 2.0) * u + ca.fabs(t - 3.0)}
-    st = variant(**changes).statement()
-    assert why_not(st, st.values) == ""
-
-
-def test_the_unchanged_variant_meets_all_conditions() -> None:
-    statement = variant().statement()
-    assert why_not(statement, statement.values) == ""
-
-
-def test_a_nonlinear_chain_does_not_apply() -> None:
-    certificate = co.certify(co.solve(mass_chain.problem(masses=1), intervals=80, progress=False))
-    assert certificate.verdict == "does not apply"
-    assert not certificate.certified
-    assert certificate.smallest_eigenvalue is None
-    assert str(certificate) == "does not apply: the rate of 'v' is not affine in state and control"
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0])
-@pytest.mark.parametrize("method", ["ipopt", "reduced"])
-@pytest.mark.parametrize("unit", [1e-9])
-@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # a share of nothing as well
-def test_nothing_is_the_global_minimum_where_nothing_costs_nothing(weight: float, method: str, unit: float) -> None:
-    """What a solver leaves of u = 0 costs a share of nothing, but no more than controls that do nothing."""
-    ocp = co.Problem(10.0)
-    x, b = ocp.state("x", initial=0.0, variance=1.0), ocp.unknown("b", mean=1.0, variance=5.0)
-    u = ocp.control("u")
-    ocp.dynamics(x, -b * x + u / unit, noise=1.0)
-    ocp.measurement("position", x, noise=1.0)
-    ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * (u / unit) ** 2 + weight * x**2)
-    certificate = co.certify(co.solve(ocp, method, intervals=20, progress=False), progress=False)
-    assert certificate.certified, str(certificate)
-    assert certificate.gap < 1e-9

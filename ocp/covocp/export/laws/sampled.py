@@ -169,7 +169,14 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         [y, last, held, measured, time, *((summed, passed) if always else ())],
         [flat(v) for v in fields.values()],
     )
-    limits = (design.statement, design.limits)
+    return _law(design, tables, samples, core, fields, tolerance)
+
+
+def _law(
+    design: Design, tables: History, samples: Samples, core: ca.Function, fields: dict[str, Any], tolerance: float
+) -> Law:
+    """What a step is and how it is called, beside its function; `fields`: what it returns, by name."""
+    limits, period = (design.statement, design.limits), samples.period
     spoken = f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."
     return Law(
         name="step",
