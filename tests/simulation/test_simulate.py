@@ -13,7 +13,7 @@ from covocp.simulation.prediction import predict
 from covocp.simulation.runs import simulate
 from covocp.simulation.sampling import THREE_SIGMA
 from covocp.simulation.schedule import base_grid
-from covocp.simulation.step_choice import choose_step
+from covocp.simulation.step_choice import MOST_STEPS, PATIENT, _pair, choose_step
 
 OPTIONS = {"progress": False}
 
@@ -219,6 +219,32 @@ def test_a_coarse_start_is_refined_and_says_so(lag, oscillations):
     assert few.settled
     assert many.settled
     assert many.longest < few.longest
+
+
+@pytest.mark.parametrize("falls", [1.0, 0.5])
+def test_the_search_of_a_step_has_an_end(lag, monkeypatch, falls):
+    """Runs that part however short the steps are, or that come together slowly: pairs would be divided without end."""
+    setting, base, tried = setting_of(lag), base_grid(lag, 2), []
+
+    def change(coarse, fine, runs):
+        return 900.0 * falls ** len(tried)
+
+    def pair(setting, coarse, fine, *given):
+        tried.append(coarse.steps)
+        return flown
+
+    flown = _pair(setting, base, base.divided(2), 2, 1, lambda: False, None)
+    monkeypatch.setattr("covocp.simulation.step_choice._pair", pair)
+    monkeypatch.setattr("covocp.simulation.step_choice._largest_change", change)
+    rates = predict(lag, setting.design, setting.design, base).step_rates
+    choice = choose_step(setting, base, rates, runs=100, seed=1, stop=lambda: False)
+    assert not choice.settled
+    assert choice.grid.steps == tried[-1]  # what is said of the step was found there
+    assert choice.change == 900.0 * falls ** len(tried)
+    assert 2 * tried[-2] < (PATIENT if falls == 1.0 else MOST_STEPS)
+    assert tried[-1] <= MOST_STEPS
+    assert choice.stalled == (falls == 1.0)
+    assert choice.stalled == ("steps are shorter" in choice.reason)
 
 
 def test_a_given_step_is_the_longest(lag, oscillator):

@@ -29,9 +29,11 @@ STABLE = 1.0
 # three standard deviations, as the bands have them.
 EXAMINED_RUNS, MATTERS = 256, 3.0
 PAIRS = 5
+# Share of the change of a pair that the next one leaves, at most, from some steps on: else no shorter ones settle it.
+FALLEN, PATIENT = 0.7, 10_000
 # Scatter of a square as a share of its mean below which it is one number.
 SAME = 1e-9
-# Steps of a first grid, at most: a filter that is still faster is not resolved, and the halving says so.
+# Steps of a grid that is halved, at most: a filter that is still faster is not resolved, and the halving says so.
 MOST_STEPS = 100_000
 
 
@@ -41,12 +43,14 @@ class StepChoice:
 
     grid: its steps. longest, shortest: of them [s]. change: largest change of a second moment at the end by halving the
     step, in sampling errors of the whole simulation; NaN where that was not looked at. settled: whether it is small
-    enough. given: whether the user gave the step; shortened: whether some are shorter, for what moves faster.
+    enough; stalled: whether it is not, and halving steps that are shorter changes as much. given: whether the user gave
+    the step; shortened: whether some are shorter, for what moves faster.
     """
 
     grid: Grid
     change: float
     settled: bool
+    stalled: bool = False
     given: bool = False
     shortened: bool = False
 
@@ -71,7 +75,13 @@ class StepChoice:
         if self.given:
             own = "as given" + (", shorter where loop, filter or model are faster" if self.shortened else "")
             return own if np.isnan(self.change) else f"{own}; {words}"
-        return words if self.settled else f"NOT SETTLED: {words}"
+        if self.settled:
+            return words
+        return f"NOT SETTLED: {words}" + (
+            ", and so it does where steps are shorter: runs that begin alike part, as where an estimate is lost"
+            if self.stalled
+            else ""
+        )
 
 
 def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
@@ -127,7 +137,8 @@ def choose_step(
         cloud: where pilot runs start; None: drawn.
 
     Returns:
-        The coarser step of the first pair that agrees to `SHARE` of the sampling error; the finest one otherwise.
+        The coarser step of the first pair that agrees to `SHARE` of the sampling error, else of the last pair: the
+        search ends where shorter steps would be too many, or change as much.
 
     Raises:
         StoppedError: when `stop` said so.
@@ -136,20 +147,29 @@ def choose_step(
     parts = base.parts(STEP_PER_RATE / np.maximum(rates, np.finfo(float).tiny), most + 1)
     unresolved = bool((parts > most).any())
     parts = np.minimum(parts, most)
-    change = np.inf
-    for _ in range(PAIRS):
+    change, stalled = np.inf, False
+    for pair in range(PAIRS):
         grids = base.divided(parts), base.divided(2 * parts)
         coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop, cloud)
-        change = _largest_change(coarse, fine, runs)
+        before, change = change, _largest_change(coarse, fine, runs)
         if unresolved and np.isfinite(fine.left).any():
             change = np.inf  # they may leave it because of the step, in both
             break
         if change <= SHARE:
-            return StepChoice(grid=base.divided(parts), change=change, settled=True)
-        # An error of second order falls by four with each halving; one or two may be left out.
-        needed = np.ceil(np.log(min(change, 1e9) / SHARE) / np.log(4.0))
-        parts = parts * 2 ** int(np.clip(needed, 1, 3))
-    return StepChoice(grid=base.divided(parts), change=change, settled=False)
+            return StepChoice(grid=grids[0], change=change, settled=True)
+        stalled = grids[1].steps > PATIENT and change > FALLEN * before
+        more = _times(change, most // int(parts.max()))
+        if stalled or pair == PAIRS - 1 or more * parts.max() > most:
+            break
+        parts = parts * more
+    return StepChoice(grid=grids[0], change=change, settled=False, stalled=stalled)
+
+
+def _times(change: float, most: int) -> int:
+    """How many times as many steps leave the allowed change, eight times at most, or `most`; twice at least."""
+    # An error of second order falls by four with each halving; one or two may be left out.
+    needed = np.ceil(np.log(min(change, 1e9) / SHARE) / np.log(4.0))
+    return max(2, min(2 ** int(np.clip(needed, 1, 3)), most))
 
 
 def _pair(

@@ -107,9 +107,8 @@ def chosen_step(
     except StoppedError:
         raise KeyboardInterrupt from None  # nothing is simulated yet
     if not chosen.settled:
-        warn_user(
-            f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. Give step=, smaller."
-        )
+        remedy = "Their bands are too narrow for that." if chosen.stalled else "Give step=, smaller."
+        warn_user(f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. {remedy}")
     return chosen
 
 
