@@ -185,3 +185,15 @@ def test_a_name_that_the_end_of_an_attitude_needs():
     rate = ocp.control("rate", 3)
     ocp.subject_to(rate, upper=np.ones(3), name="final attitude")
     ocp.attitude("attitude", initial=np.eye(3), final=so3.exp([0.1, 0.0, 0.0]), rate=rate)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, ca.DM, lambda value: ca.MX(ca.DM(value))])
+def test_an_attitude_times_a_vector_turns_it(kind):
+    """A third of a turn about the diagonal: x becomes y or z; C = exp(-phi^x) has r_b = C r_a."""
+    _, attitude = declared()
+    turned = ca.Function(
+        "turned", [attitude.quaternion], [attitude @ kind([1.0, 2.0, 3.0]), kind([[1.0, 2.0, 3.0]]) @ attitude]
+    )
+    after, before = (value.full().ravel() for value in turned([0.5, 0.5, 0.5, 0.5]))
+    assert after == pytest.approx([2.0, 3.0, 1.0])
+    assert before == pytest.approx([3.0, 1.0, 2.0])

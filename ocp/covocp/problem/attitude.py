@@ -35,6 +35,7 @@ class Attitude:
     quaternion: ca.MX
 
     __repr__ = short_repr
+    __array_ufunc__ = None  # an array times an attitude asks the attitude
 
     @property
     def matrix(self) -> ca.MX:
@@ -45,6 +46,14 @@ class Attitude:
     def vector(self) -> ca.MX:
         """The rotation vector phi of C = e^{-phi^x}, |phi| <= pi, shape (3, 1) [rad]; it jumps at half a turn."""
         return ca.MX(so3.log(self.matrix))
+
+    def __matmul__(self, other: Given) -> ca.MX:
+        """C times a vector or matrix, as `attitude.matrix @ other`."""
+        return ca.MX(self.matrix @ other)
+
+    def __rmatmul__(self, other: Given) -> ca.MX:
+        """A matrix times C, as `other @ attitude.matrix`."""
+        return ca.MX(ca.mtimes(other, self.matrix))
 
     def error(self, reference: Given) -> ca.MX:
         """The rotation vector, in body axes, by which the attitude differs from another one, shape (3, 1) [rad].

@@ -169,7 +169,8 @@ def _times(change: float, most: int) -> int:
     """How many times as many steps leave the allowed change, eight times at most, or `most`; twice at least."""
     # An error of second order falls by four with each halving; one or two may be left out.
     needed = np.ceil(np.log(min(change, 1e9) / SHARE) / np.log(4.0))
-    return max(2, min(2 ** int(np.clip(needed, 1, 3)), most))
+    wanted = 2 ** int(np.clip(needed, 1, 3))
+    return int(max(2, min(wanted, most)))
 
 
 def _pair(
