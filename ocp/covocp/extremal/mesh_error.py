@@ -475,6 +475,7 @@ def _missed(extremal: Extremal, finer: Refined, parts: int, within: Within | Non
         return 0.0
     along = finer.matrices[-1] - t.e[-1]
     if len(mesh.segments) == 1:
+        along = along if mesh.eliminated else finer.jumps[-1, st.nx :]
         return float(held @ finer.jumps[-1, : st.nx] + held_matrices @ along)
     drift = nominal_along(extremal, parts)[-1] - t.x[-1]
     if is_lost(extremal, np.abs(drift)):

@@ -6,7 +6,7 @@ are off grows with the plant through all that follow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -90,7 +90,13 @@ def matrices_along_controls(extremal: Extremal) -> Array:
 
 @lru_cache(maxsize=2)
 def _whole(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
-    return refined_run(statement, in_one_segment(mesh), trajectory, np.array(parameters))
+    run = refined_run(statement, in_one_segment(mesh), trajectory, np.array(parameters))
+    # at the end it has what is given there; the run itself ends a gap away from that
+    states, matrices, gap = run.states.copy(), run.matrices.copy(), run.jumps[-1]
+    states[-1] += gap[: statement.nx]
+    if gap.size > statement.nx:
+        matrices[-1] += gap[statement.nx :]
+    return replace(run, states=states, matrices=matrices)
 
 
 def _largest(change: Array) -> Array:

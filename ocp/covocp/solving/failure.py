@@ -10,12 +10,16 @@ import numpy as np
 from covocp.base.errors import SolveError
 from covocp.extremal.densities import impossible_density, impossible_in_phases
 from covocp.extremal.extremal import Extremal, Outcome
+from covocp.extremal.given_controls import missed
+from covocp.extremal.open_loop import matrices_along_controls
 from covocp.solution.report import stated_first
 from covocp.solution.solution import Solution
 from covocp.solving.decisions import bent_cost, bent_data, far_away
 
 # Violations that are named.
 NAMED = 10
+# How rows begin that keep a state or matrix in one piece.
+GAP = "continuity of "
 
 
 def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_way: str) -> SolveError:
@@ -28,7 +32,9 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         solution: the last iterate.
         other_way: a line about another method; empty: none.
     """
-    lines = [f"  {row}: {value:.6g}" for row, value in stated_first(outcome.violations)[:NAMED]]
+    along = _passed_along(outcome)
+    violations = along | {row: max(value, along.get(row, 0.0)) for row, value in outcome.violations.items()}
+    lines = [f"  {row}: {value:.6g}" for row, value in stated_first(violations)[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
     noise = impossible_noises([outcome.extremal], outcome.message)
     return SolveError(
@@ -36,8 +42,26 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         f"{violated}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{other_way}"
         "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
         solution=solution,
-        violations=outcome.violations,
+        violations=violations,
     )
+
+
+def _passed_along(outcome: Outcome) -> dict[str, float]:
+    """Limits that the covariances pass which the last controls give, where only the gaps of matrices are left.
+
+    A run whose limits contradict may end with what it cannot have in these gaps, at a covariance that is none of the
+    problem: that meets the limits.
+    """
+    extremal, st = outcome.extremal, outcome.extremal.statement
+    gaps = {name.removeprefix(GAP) for name in outcome.violations if name.startswith(GAP)}
+    if not gaps or not gaps <= set(st.matrix_names):
+        return {}
+    try:
+        along = matrices_along_controls(extremal)
+        given = replace(extremal, trajectory=replace(extremal.trajectory, e=along))
+        return missed(given) if np.isfinite(along).all() else {}
+    except (RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):  # an iterate without values
+        return {}
 
 
 def possible(outcome: Outcome) -> tuple[Outcome, bool]:
