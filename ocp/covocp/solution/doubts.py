@@ -9,6 +9,7 @@ from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
+from covocp.solution.origin import METHOD
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
 from covocp.transcription.scales import choose_scales
@@ -46,7 +47,8 @@ def mention_doubts(solution: Solution) -> None:
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
             + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
-            + "Use more intervals or substeps."
+            + ("U" if solution.method == METHOD else "Let refine=1e-4 put nodes where they are needed, or u")
+            + "se more intervals or substeps."
         )
     elif alone:
         pass  # said already, with what the steps are off at the nodes
