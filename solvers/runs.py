@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.residuals import LEFT, MUCH_LEFT, VIOLATION, Residuals
+from covocp.base.residuals import LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
@@ -147,7 +147,7 @@ class Runs:
             "hessian": "limited-memory" if self._limited else "exact",
         }
         left = 0.0 if last.settled or not last.converged or last.residuals is None else last.residuals.complementarity
-        counts |= {LEFT: left} if left > MUCH_LEFT else {}
+        counts[LEFT] = left  # always, so that none of an earlier run stays
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 

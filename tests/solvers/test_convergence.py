@@ -145,6 +145,26 @@ def test_what_no_run_makes_less_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     assert 0.0 < 1 - 1 / (1 + 1e-8) / found.cost < bound
 
 
+def halves() -> co.Phases:
+    """`penalised(1e8, unit=1.0, limit=3.0)` in two phases."""
+    parts = []
+    for k in range(2):
+        ocp = co.Problem(duration=0.5, name=f"half {k}")
+        x, u = ocp.state("x", initial=0.0 if k == 0 else None), ocp.control("u", lower=-3.0, upper=3.0)
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2, terminal=k * 1e8 * (x - 1.0) ** 2)
+        parts.append(ocp)
+    return co.Phases(parts)
+
+
+def test_phases_hide_nothing_either_and_tell_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert co.solve(halves(), intervals=10, progress=False).cost == pytest.approx(1 / (1 + 1e-8), rel=1e-6)
+    monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
+    with pytest.warns(co.CovocpWarning, match="above the least one") as told:
+        co.solve(halves(), intervals=10, progress=False)
+    assert len(told) == 1
+
+
 def correlated(seed: int) -> co.Problem:
     """A lag whose final correlation of state and unknown is limited."""
     r = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
-from covocp.base.residuals import LEFT
+from covocp.base.residuals import LEFT, MUCH_LEFT
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
@@ -62,7 +62,6 @@ def mention_doubts(solution: Solution) -> None:
     else:
         fine = True
         _mention_loop(solution)
-    mention_left(solution.stats)
     mention_spread(solution)
     if not jumps:
         _mention_slopes(solution, fine)
@@ -75,9 +74,9 @@ def mention_doubts(solution: Solution) -> None:
         )
 
 
-def mention_left(stats: Mapping[str, Any]) -> None:
+def mention_gap(stats: Mapping[str, Any]) -> None:
     """Warn of a cost that is still above the least one, by what multipliers and distances from bounds bound."""
-    if LEFT in stats:
+    if stats.get(LEFT, 0.0) > MUCH_LEFT:
         warn_user(
             f"The cost may be up to {stats[LEFT]:.1e} (relative to it) above the least one: multipliers push at bounds "
             "that are not reached, and further runs changed that no more. Start again from this solution (guess=) with "
