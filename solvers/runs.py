@@ -214,8 +214,8 @@ class Runs:
                 kept = found.hold_of_changes(self._limit)
                 if its.hold(self._limit) or (not kept and its.hold_of_changes(self._limit)):
                     point, where, found = inside, inside.where, its
-        settled = found.hold(self._limit)
-        converged = settled or found.hold_of_changes(self._limit)
+        converged = found.hold(self._limit) or found.hold_of_changes(self._limit)
+        settled = found.settle(self._limit)
         return Round(nlp=nlp, point=point, where=where, residuals=found, converged=converged, settled=settled)
 
     def _rescaled(

@@ -38,6 +38,8 @@ VANISHING = 0.1
 # Shares of that change which count as no cost: its slopes are rounded to some 1e-16 of it, their sum over all nodes to
 # 1e-14, `LIMIT` times the first one. Distances from bounds are not rounded so.
 ROUNDED, NO_SIZE = 1e-9, 1e-12
+# Slope of a point that meets what it has to from which on another run is worth it: its square is what can be had.
+STEEP = 1e-3
 # Complementarity that a solver could not make less and that is told, and what it is among the counts of a solution.
 LEFT, MUCH_LEFT = "complementarity_left", 1e-4
 
@@ -82,6 +84,12 @@ class Residuals:
         most = limit * max(1.0, VANISHING * self.varied / self.size)
         parts = (self.slope, self.complementarity, self.infeasibility)
         return all(part <= most for part in parts) and self.violation <= VIOLATION
+
+    def settle(self, limit: float) -> bool:
+        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is."""
+        slope, *others = self._resolved
+        gentle = slope <= max(STEEP, limit) and all(part <= limit for part in others)
+        return self.hold(limit) or (gentle and self.hold_of_changes(limit))
 
     @property
     def _resolved(self) -> tuple[float, float, float]:
