@@ -171,7 +171,7 @@ class Runs:
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
             if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
-                self._tighten(best.residuals)
+                self._tighten(best.residuals if best.converged else best.residuals.of_changes())
             self._patience = max(FEW_MORE, *(entry.point.iterations for entry in done)) if best.converged else None
             point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
             found = self._judged(nlp, point, parameters, again=True)

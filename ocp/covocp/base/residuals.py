@@ -18,7 +18,7 @@ it, and runs go on to what is small of the cost itself as long as that helps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -81,9 +81,17 @@ class Residuals:
 
     def hold_of_changes(self, limit: float) -> bool:
         """Whether they are where the variables' changes of the cost are its size, if these are more (`VANISHING`)."""
-        most = limit * max(1.0, VANISHING * self.varied / self.size)
-        parts = (self.slope, self.complementarity, self.infeasibility)
-        return all(part <= most for part in parts) and self.violation <= VIOLATION
+        found = self.of_changes()
+        parts = (found.slope, found.complementarity, found.infeasibility)
+        return all(part <= limit for part in parts) and self.violation <= VIOLATION
+
+    def of_changes(self) -> Residuals:
+        """The same relative to what the variables change of the cost, where that is its size."""
+        size = max(self.size, VANISHING * self.varied)
+        slope, apart, missed = (
+            part * self.size / size for part in (self.slope, self.complementarity, self.infeasibility)
+        )
+        return replace(self, slope=slope, complementarity=apart, infeasibility=missed, size=size, varied=0.0)
 
     def settle(self, limit: float) -> bool:
         """Whether no further run is worth it: all small relative to the cost, slopes so that their square is."""
