@@ -77,6 +77,7 @@ class Monitor(ca.Callback):
         self._impatient, self.wandered = False, False
         self._least, self._since = np.inf, 0
         self._steps, self._crawling, self.crawled = _Steps(), False, False
+        self._patience: int | None = None
         self.best: Iterate | None = None  # of a run that a limit may end
         self.construct("progress", {})
 
@@ -87,6 +88,7 @@ class Monitor(ca.Callback):
         bounds: dict[str, Array],
         impatient: bool = False,
         crawling: bool = False,
+        patience: int | None = None,
     ) -> None:
         """Report to this progress from now on.
 
@@ -96,11 +98,13 @@ class Monitor(ca.Callback):
             bounds: of the program.
             impatient: whether a run that has lost its way is stopped.
             crawling: whether one is that crawls.
+            patience: iterations after which one is; None: those that the solver allows.
         """
         self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
         self._impatient, self.wandered = impatient, False
         self._least, self._since = np.inf, 0
         self._steps, self._crawling, self.crawled = _Steps(), crawling, False
+        self._patience = patience
         self.best = None
 
     def get_n_in(self) -> int:
@@ -146,7 +150,8 @@ class Monitor(ca.Callback):
         self._progress.update(self._iteration, cost * self._scale, violation)
         self._iteration += 1
         self.crawled = self._crawling and self._steps.same(w) >= SAME_STEPS
-        return self._progress.stop or self.crawled or self._wanders(violation)
+        spent = self._patience is not None and self._iteration > self._patience
+        return self._progress.stop or self.crawled or spent or self._wanders(violation)
 
     def _wanders(self, violation: float) -> bool:
         """Whether a run that need not be finished has made no progress for long."""

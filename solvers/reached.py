@@ -11,7 +11,7 @@ import numpy as np
 
 from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
-from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
+from covocp.base.residuals import LIMIT, NO_SIZE, Residuals, complementary
 from covocp.base.short_repr import short_repr
 from covocp.solvers.at_point import AtPoint, Weighed
 from covocp.transcription.nlp import NLP, Scales
@@ -70,13 +70,18 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Round:
-    """A run, with its residuals where it ended at a point that may be stationary."""
+    """A run, with its residuals where it ended at a point that may be stationary.
+
+    converged: whether these hold, relative to the cost or to what the variables change of it. settled: relative to the
+    cost, so that no further run is worth it.
+    """
 
     nlp: Program
     point: Point
     where: Evaluated
     residuals: Residuals | None
     converged: bool
+    settled: bool
 
     __repr__ = short_repr
 
@@ -228,14 +233,15 @@ def residuals(
     met = (
         point.status != ACCEPTABLE
     )  # where not even its own tolerance is, an unstable plant makes any change look large
+    varied = 0.0
     if met and not bound and max(slope, rest, missed) > LIMIT * size:
         moved = _change(first, point.w, by_w, nlp.units(scales), parameters)
         each = zip(nlp.each(trajectories, parameters), scales, strict=True)
         own = np.sum([_change_at_nodes(*entry, units) for entry, units in each])
-        size = max(size, VANISHING * min(moved, float(own)))
-    size = max(size, float(np.finfo(float).tiny))
+        varied = min(moved, float(own))
+    size = max(size, NO_SIZE * varied, float(np.finfo(float).tiny))
     changes = {"slope": slope / size, "complementarity": rest / size, "infeasibility": missed / size}
-    return Residuals(**changes, violation=worst, size=size)
+    return Residuals(**changes, violation=worst, size=size, varied=varied)
 
 
 def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: Arrays) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.residuals import VIOLATION, Residuals
+from covocp.base.residuals import LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
@@ -49,6 +49,10 @@ GIVEN_ROUNDS = 3
 ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
 # Residuals that are larger by less than this factor are those of the same point.
 UNMOVED = 1.0 + 1e-9
+# A point that has converged is left for the next one as long as that has no more than this share of its residuals.
+HELPED = 0.5
+# Iterations of such a run, if none before took more.
+FEW_MORE = 50
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
@@ -92,6 +96,7 @@ class Runs:
         # Ipopt tells its functions and its iterations, and takes multipliers to start from
         self._open = plugin == "ipopt"
         self._strictness = self._share = 1.0  # of the tolerance, and of the unit of the cost
+        self._patience: int | None = None  # iterations of a run from a point that has converged
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: Monitor | None = None
         self._nlp: Program | None = None
@@ -110,7 +115,7 @@ class Runs:
             The last run, and its counts.
         """
         begin = time.perf_counter()
-        self._share = 1.0
+        self._share, self._patience = 1.0, None
         if self._strictness < 1.0:
             self._strictness = 1.0
             self._solvers.pop("warm", None)
@@ -141,6 +146,8 @@ class Runs:
             "return_status": last.point.status,
             "hessian": "limited-memory" if self._limited else "exact",
         }
+        left = 0.0 if last.settled or not last.converged or last.residuals is None else last.residuals.complementarity
+        counts[LEFT] = left  # always, so that none of an earlier run stays
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
@@ -153,8 +160,10 @@ class Runs:
         done = [self._judged(nlp, first, parameters)]
         begun: tuple[Any, ...] = ()
         idle = 0
-        while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
+        while not done[-1].settled and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
             best = _best(done)
+            if best.converged and not _helped(done):
+                break
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
             given = len(done) < GIVEN_ROUNDS
@@ -162,11 +171,15 @@ class Runs:
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
             if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
-                self._tighten(best.residuals)
+                self._tighten(best.residuals if best.converged else best.residuals.of_changes())
+            self._patience = max(FEW_MORE, *(entry.point.iterations for entry in done)) if best.converged else None
             point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
-            done.append(self._judged(nlp, point, parameters, again=True))
+            found = self._judged(nlp, point, parameters, again=True)
+            # magnitudes that vanish with the cost leave nothing to compare it with, but the point before
+            better = best.converged and _left(found) <= HELPED * _left(best)
+            done.append(replace(found, converged=found.converged or better))
             idle += point.iterations == 0
-        if not done[-1].converged:
+        if not done[-1].settled:
             done.append(done.pop(done.index(_best(done))))
         return done
 
@@ -189,7 +202,7 @@ class Runs:
         where = point.where
         status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
-            return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
+            return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False, settled=False)
         first = self._first_order()
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
@@ -198,9 +211,12 @@ class Runs:
             if not found.hold(self._limit):
                 inside = _within(nlp, point, parameters)
                 its = residuals(first, inside, parameters, inside.where, scales)
-                if its.hold(self._limit):
+                kept = found.hold_of_changes(self._limit)
+                if its.hold(self._limit) or (not kept and its.hold_of_changes(self._limit)):
                     point, where, found = inside, inside.where, its
-        return Round(nlp=nlp, point=point, where=where, residuals=found, converged=found.hold(self._limit))
+        converged = found.hold(self._limit) or found.hold_of_changes(self._limit)
+        settled = found.settle(self._limit)
+        return Round(nlp=nlp, point=point, where=where, residuals=found, converged=converged, settled=settled)
 
     def _rescaled(
         self, last: Round, first: Program, parameters: Arrays, dual: bool, given: bool
@@ -231,12 +247,12 @@ class Runs:
         if start.lam_x is not None and start.lam_g is not None:
             arguments |= {"lam_x0": start.lam_x / scale, "lam_g0": start.lam_g / scale}
         if self._monitor is not None:
-            self._monitor.attach(progress, scale, bounds, tentative, self._may_crawl)
+            self._monitor.attach(progress, scale, bounds, tentative, self._may_crawl, self._patience)
         result, stats = self._called(solver, arguments)
         concave = bool(stats.get("concave"))
         if self._monitor is not None and self._monitor.crawled:
             concave = True
-            self._monitor.attach(progress, scale, bounds, tentative)
+            self._monitor.attach(progress, scale, bounds, tentative, patience=self._patience)
             taken = int(stats.get("iter_count", 0))
             arguments["x0"] = np.clip(_numbers(result["x"]), bounds["lbx"], bounds["ubx"])
             result, stats = self._called(self._solver(False, bold=True), arguments)
@@ -451,8 +467,25 @@ def _within(nlp: Program, point: Point, parameters: Arrays) -> Point:
     return replace(point, w=w, where=nlp.unpack(w, parameters))
 
 
+def _left(entry: Round) -> float:
+    """The largest change of the cost that a point leaves, in the unit of the cost; inf where that is not known."""
+    found = entry.residuals
+    return np.inf if found is None or found.violation > VIOLATION else found.worst * found.size
+
+
+def _helped(rounds: list[Round]) -> bool:
+    """Whether the last run left less than the ones before, or did not move at all, so that more is to be asked."""
+    if len(rounds) == 1 or rounds[-1].point.iterations == 0:
+        return True
+    return _left(rounds[-1]) <= HELPED * _left(_best(rounds[:-1]))
+
+
 def _best(rounds: list[Round]) -> Round:
-    """The round with the least residuals in the smallest cost without violations; the last where it did not move."""
+    """The round with the least residuals in the smallest cost without violations; the last where it did not move.
+
+    One that converged before all others.
+    """
+    rounds = [entry for entry in rounds if entry.converged] or rounds
     judged = [entry.residuals for entry in rounds]
     size = min((found.size for found in judged if found and found.violation <= VIOLATION), default=np.inf)
     worst = [np.inf if found is None else found.beside(size) for found in judged]

@@ -100,6 +100,71 @@ def test_multipliers_of_inactive_bounds_are_no_stationarity() -> None:
     assert complementarity(solution.extremal) == pytest.approx(11 * 0.025 * 0.5 / 0.5, rel=1e-6)
 
 
+def penalised(weight: float, *, unit: float, limit: float) -> co.Problem:
+    """x' = u/unit, |u/unit| <= limit, J = int (u/unit)^2 + weight (x(1) - 1)^2.
+
+    From x(0) = 0 a constant u is best: J = weight/(1 + weight) where the limit lets it.
+    """
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u", lower=-limit * unit, upper=limit * unit)
+    ocp.dynamics(x, u / unit)
+    ocp.minimize(running=(u / unit) ** 2, terminal=weight * (x - 1.0) ** 2)
+    return ocp
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0])
+@pytest.mark.parametrize(("weight", "limit"), [(1e6, 3.0), (1e8, 0.5), (1e8, 1.5), (1e8, 50.0), (1e10, 50.0)])
+def test_large_penalties_hide_nothing_of_the_cost(weight: float, limit: float, unit: float) -> None:
+    # what is left at bounds was compared with a tenth of the penalty: costs up to 32 times too high were called solved
+    least = weight / (1 + weight) if limit > 1 else limit**2 + weight * (1 - limit) ** 2
+    found = co.solve(penalised(weight, unit=unit, limit=limit), intervals=20, progress=False)
+    assert found.cost == pytest.approx(least, rel=1e-6)
+    assert found.stats.get("rounds", 1) <= 3
+
+
+def test_a_limit_on_a_state_beside_a_large_penalty() -> None:
+    # x' = v, v' = u: from 0 to 0.4 in 1 s at v <= 0.5 v rises and falls by parabolas of slope 0 at the limit, each for
+    # r with 1 - 2 r/3 = 0.8: J = 2 int u^2 = 2 (4/3) 0.5^2/r, against which 1e7 (x - 0.4)^2 + 1e7 v^2 gives way by 3e-6
+    ocp = co.Problem(duration=1.0)
+    x, v, u = ocp.state("x", initial=0.0), ocp.state("v", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.subject_to(v, upper=0.5)
+    ocp.minimize(running=u**2, terminal=1e7 * ((x - 0.4) ** 2 + v**2))
+    found = co.solve(ocp, intervals=40, progress=False, control="linear")
+    assert found.cost == pytest.approx(2 * 4 / 3 * 0.25 / 0.3, rel=1e-3)  # the kink lies between nodes
+    assert found.optimality.complementarity is not None
+    assert found.optimality.complementarity < 1e-5
+
+
+def test_what_no_run_makes_less_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
+    with pytest.warns(co.CovocpWarning, match="The cost may be up to .* above the least one") as told:
+        found = co.solve(penalised(1e8, unit=1.0, limit=3.0), intervals=20, progress=False)
+    bound = float(str(told[0].message).split("up to ")[1].split()[0])
+    assert 0.0 < 1 - 1 / (1 + 1e-8) / found.cost < bound
+
+
+def halves() -> co.Phases:
+    """`penalised(1e8, unit=1.0, limit=3.0)` in two phases."""
+    parts = []
+    for k in range(2):
+        ocp = co.Problem(duration=0.5, name=f"half {k}")
+        x, u = ocp.state("x", initial=0.0 if k == 0 else None), ocp.control("u", lower=-3.0, upper=3.0)
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2, terminal=k * 1e8 * (x - 1.0) ** 2)
+        parts.append(ocp)
+    return co.Phases(parts)
+
+
+def test_phases_hide_nothing_either_and_tell_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert co.solve(halves(), intervals=10, progress=False).cost == pytest.approx(1 / (1 + 1e-8), rel=1e-6)
+    monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
+    with pytest.warns(co.CovocpWarning, match="above the least one") as told:
+        co.solve(halves(), intervals=10, progress=False)
+    assert len(told) == 1
+
+
 def correlated(seed: int) -> co.Problem:
     """A lag whose final correlation of state and unknown is limited."""
     r = np.random.default_rng(seed)

@@ -8,12 +8,17 @@ reached: by how much would the cost J change, to first order, if
 - each inequality that has a multiplier were met exactly (`complementarity`),
 - each violated constraint were met exactly (`infeasibility`),
 
-all relative to the cost. The gain still to be had is of the order of the square of the first of them.
+all relative to the cost. The gain still to be had is of the order of the square of the first of them, but all of the
+second: for a convex problem the cost is above the least one by no more than that, and often by as much.
+
+A cost that vanishes (tracking) has no size of its own. What the variables change of it by their magnitudes is one, but
+no measure of what can still be had: beside a terminal penalty of 1e6 it is 1e6 times the cost. So a point has to meet
+it, and runs go on to what is small of the cost itself as long as that helps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +35,13 @@ PASSED = 1e-7
 BETWEEN_NODES = 1e-5
 # A cost below this share of what the controls change of it (a tracking cost that vanishes) has no size of its own.
 VANISHING = 0.1
+# Shares of that change which count as no cost: its slopes are rounded to some 1e-16 of it, their sum over all nodes to
+# 1e-14, `LIMIT` times the first one. Distances from bounds are not rounded so.
+ROUNDED, NO_SIZE = 1e-9, 1e-12
+# Slope of a point that meets what it has to from which on another run is worth it: its square is what can be had.
+STEEP = 1e-3
+# Complementarity that a solver could not make less and that is told, and what it is among the counts of a solution.
+LEFT, MUCH_LEFT = "complementarity_left", 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +54,7 @@ class Residuals:
         infeasibility: sum of |multiplier| times violation over all constraints.
         violation: largest violation, in magnitudes of what is constrained.
         size: of the cost, to which the others are relative.
+        varied: what the variables change of the cost by their magnitudes, to second order; 0: not asked for.
     """
 
     slope: float
@@ -49,6 +62,7 @@ class Residuals:
     infeasibility: float
     violation: float
     size: float = 1.0
+    varied: float = 0.0
 
     @property
     def worst(self) -> float:
@@ -58,14 +72,38 @@ class Residuals:
     def beside(self, size: float) -> float:
         """`worst` relative to this size where it is less: what a point of huge cost leaves is little of that alone."""
         times = max(self.size / size, 1.0)
-        changes = [times * part for part in (self.slope, self.complementarity, self.infeasibility)]
-        parts = [*changes, LIMIT * self.violation / VIOLATION]
+        parts = [*(times * part for part in self._resolved), LIMIT * self.violation / VIOLATION]
         return float(np.where(np.isnan(parts), np.inf, parts).max())
 
     def hold(self, limit: float) -> bool:
         """Whether all are small: those of the cost below `limit`, the violation below VIOLATION."""
-        parts = (self.slope, self.complementarity, self.infeasibility)
+        return all(part <= limit for part in self._resolved) and self.violation <= VIOLATION
+
+    def hold_of_changes(self, limit: float) -> bool:
+        """Whether they are where the variables' changes of the cost are its size, if these are more (`VANISHING`)."""
+        found = self.of_changes()
+        parts = (found.slope, found.complementarity, found.infeasibility)
         return all(part <= limit for part in parts) and self.violation <= VIOLATION
+
+    def of_changes(self) -> Residuals:
+        """The same relative to what the variables change of the cost, where that is its size."""
+        size = max(self.size, VANISHING * self.varied)
+        slope, apart, missed = (
+            part * self.size / size for part in (self.slope, self.complementarity, self.infeasibility)
+        )
+        return replace(self, slope=slope, complementarity=apart, infeasibility=missed, size=size, varied=0.0)
+
+    def settle(self, limit: float) -> bool:
+        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is."""
+        slope, *others = self._resolved
+        gentle = slope <= max(STEEP, limit) and all(part <= limit for part in others)
+        return self.hold(limit) or (gentle and self.hold_of_changes(limit))
+
+    @property
+    def _resolved(self) -> tuple[float, float, float]:
+        """The changes of the cost, those by slopes relative to what these are known to, where that is more."""
+        rounded = max(1.0, ROUNDED * self.varied / self.size)
+        return self.slope / rounded, self.complementarity, self.infeasibility / rounded
 
     def __str__(self) -> str:
         """The residuals in words, for a message."""

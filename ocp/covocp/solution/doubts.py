@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
+from covocp.base.residuals import LEFT, MUCH_LEFT
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
@@ -69,6 +73,16 @@ def mention_doubts(solution: Solution) -> None:
         warn_user(
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             f"{other}more intervals."
+        )
+
+
+def mention_gap(stats: Mapping[str, Any]) -> None:
+    """Warn of a cost that is still above the least one, by what multipliers and distances from bounds bound."""
+    if stats.get(LEFT, 0.0) > MUCH_LEFT:
+        warn_user(
+            f"The cost may be up to {stats[LEFT]:.1e} (relative to it) above the least one: multipliers push at bounds "
+            "that are not reached, and further runs changed that no more. Start again from this solution (guess=) with "
+            "a smaller tolerance=, or make the largest weights of the cost smaller, or conditions of them."
         )
 
 

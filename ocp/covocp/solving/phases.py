@@ -15,7 +15,7 @@ from covocp.extremal.densities import impossible_in_phases
 from covocp.extremal.links import ChainOutcome
 from covocp.extremal.phase_curvature import curvature_between_links, stayed
 from covocp.problem.phases import Phases
-from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
 from covocp.solution.patience import longest
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import stated_first
@@ -188,6 +188,7 @@ def _finished(solution: PhasesSolution, allow_failure: bool) -> PhasesSolution:
     for phase in solution.phases:
         mention_doubts(phase)
         mention_limits(phase)
+    mention_gap(solution.stats)
     _mention_saddles(solution)
     return solution
 

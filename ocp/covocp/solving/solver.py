@@ -22,7 +22,7 @@ from covocp.extremal.given_controls import evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
-from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
 from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving import refining
@@ -492,6 +492,7 @@ class Solver:
             raise failure(self.statement.name, self.method, told, solution, other_way)
         if told.converged and assess:
             mention_doubts(solution)
+            mention_gap(solution.stats)
             mention_limits(solution)
         return solution
 
