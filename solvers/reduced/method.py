@@ -22,7 +22,7 @@ from covocp.extremal.extremal import Guess, Outcome
 from covocp.passage.sweep import passed_by
 from covocp.solvers.at_point import AtPoint
 from covocp.solvers.endings import Ending
-from covocp.solvers.reached import Magnitudes
+from covocp.solvers.reached import Magnitudes, Point, Round
 from covocp.solvers.reduced.engine import Engine
 from covocp.solvers.reduced.statuses import Status
 from covocp.solvers.runs import Kind, Runs, share_for
@@ -143,6 +143,12 @@ class ReducedRuns(Runs):
         """Those of the sequence on the present program."""
         engine = self._solvers.get("cold")
         return None if engine is None else engine.functions
+
+    def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
+        """As of Ipopt, but for a cost beside whose penalties no step is seen any more: another method may see some."""
+        found = super()._judged(nlp, point, parameters, again)
+        lost = found.converged and found.residuals is not None and not found.settled and found.residuals.too_steep
+        return replace(found, converged=False) if lost else found
 
     def _tighten(self, found: Residuals) -> None:
         """All by the tolerance: nothing here is compared with one. What led to no step at all is not asked again."""

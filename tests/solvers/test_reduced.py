@@ -285,3 +285,14 @@ def test_rounds_that_begin_where_the_last_one_did_ask_for_more():
     assert one.converged
     assert one.cost == pytest.approx(other.cost, rel=1e-8)
     assert one.optimality.stationarity < 1e-5
+
+
+def test_beside_a_penalty_that_hides_every_step_no_point_is_called_solved() -> None:
+    """The least cost is W/(1 + W); it was called solved at 1.6 times that."""
+    ocp = co.Problem(1.0, name="penalty")
+    x, u = ocp.state("x", initial=0.0), ocp.control("u", lower=-3.0, upper=3.0)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2, terminal=1e10 * (x - 1) ** 2)
+    found = co.solve(ocp, "reduced", intervals=20, progress=False, allow_failure=True)
+    assert not found.converged or found.cost == pytest.approx(1.0, rel=1e-4)
+    assert co.solve(ocp, "auto", intervals=20, progress=False).cost == pytest.approx(1.0, rel=1e-4)

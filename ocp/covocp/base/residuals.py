@@ -40,6 +40,9 @@ VANISHING = 0.1
 ROUNDED, NO_SIZE = 1e-9, 1e-12
 # Slope of a point that meets what it has to from which on another run is worth it: its square is what can be had.
 STEEP = 1e-3
+# Slope, resolved and as large beside the cost, from which on more than a small share of the cost may be had; costs that
+# are none, whose slopes are none either.
+TOO_STEEP, NOTHING = 0.1, 1e-24
 # Complementarity that a solver could not make less and that is told, and what it is among the counts of a solution.
 LEFT, MUCH_LEFT = "complementarity_left", 1e-4
 
@@ -98,6 +101,11 @@ class Residuals:
         slope, *others = self._resolved
         gentle = slope <= max(STEEP, limit) and all(part <= limit for part in others)
         return self.hold(limit) or (gentle and self.hold_of_changes(limit))
+
+    @property
+    def too_steep(self) -> bool:
+        """Whether much of the cost may still be had along the slopes."""
+        return self._resolved[0] > TOO_STEEP and self.size > NOTHING
 
     @property
     def _resolved(self) -> tuple[float, float, float]:
