@@ -78,6 +78,7 @@ class Monitor(ca.Callback):
         self._least, self._since = np.inf, 0
         self._steps, self._crawling, self.crawled = _Steps(), False, False
         self._patience: int | None = None
+        self.spent = False  # that patience
         self.best: Iterate | None = None  # of a run that a limit may end
         self.construct("progress", {})
 
@@ -104,7 +105,7 @@ class Monitor(ca.Callback):
         self._impatient, self.wandered = impatient, False
         self._least, self._since = np.inf, 0
         self._steps, self._crawling, self.crawled = _Steps(), crawling, False
-        self._patience = patience
+        self._patience, self.spent = patience, False
         self.best = None
 
     def get_n_in(self) -> int:
@@ -150,8 +151,8 @@ class Monitor(ca.Callback):
         self._progress.update(self._iteration, cost * self._scale, violation)
         self._iteration += 1
         self.crawled = self._crawling and self._steps.same(w) >= SAME_STEPS
-        spent = self._patience is not None and self._iteration > self._patience
-        return self._progress.stop or self.crawled or spent or self._wanders(violation)
+        self.spent = self._patience is not None and self._iteration > self._patience
+        return self._progress.stop or self.crawled or self.spent or self._wanders(violation)
 
     def _wanders(self, violation: float) -> bool:
         """Whether a run that need not be finished has made no progress for long."""

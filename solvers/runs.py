@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.residuals import LEFT, VIOLATION, Residuals
+from covocp.base.residuals import MUCH_LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
@@ -51,8 +51,8 @@ ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
 UNMOVED = 1.0 + 1e-9
 # A point that has converged is left for the next one as long as that has no more than this share of its residuals.
 HELPED = 0.5
-# Iterations of such a run, if none before took more.
-FEW_MORE = 50
+# Iterations of such a run, if none before took more; of one that learns its Hessian.
+FEW_MORE, FEW_MORE_LEARNT = 50, 300
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
@@ -73,6 +73,9 @@ REMEDY = "start closer (guess=), or give the magnitudes of states and controls (
 
 class Runs:
     """Runs of an NLP solver on one program; it is built at the first start, which gives its scales."""
+
+    # What is made of a program, and of no other.
+    _OF_PROGRAM: tuple[str, ...] = ("_nlp", "_monitor", "_solvers", "_functions", "_nodes", "_slopes")
 
     def __init__(
         self,
@@ -146,8 +149,9 @@ class Runs:
             "return_status": last.point.status,
             "hessian": "limited-memory" if self._limited else "exact",
         }
-        left = 0.0 if last.settled or not last.converged or last.residuals is None else last.residuals.complementarity
-        counts[LEFT] = left  # always, so that none of an earlier run stays
+        unsettled = last.converged and not last.settled and last.residuals is not None
+        left = last.residuals.left if unsettled and last.residuals is not None else {}
+        counts |= dict.fromkeys(MUCH_LEFT, 0.0) | left  # always, so that none of an earlier run stays
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
@@ -159,29 +163,38 @@ class Runs:
         """
         done = [self._judged(nlp, first, parameters)]
         begun: tuple[Any, ...] = ()
-        idle = 0
+        idle, kept = 0, None
         while not done[-1].settled and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
             best = _best(done)
             if best.converged and not _helped(done):
                 break
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
+            if best.converged and kept is None:
+                kept = self._made()
             given = len(done) < GIVEN_ROUNDS
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best, given=given)
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
             if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
                 self._tighten(best.residuals if best.converged else best.residuals.of_changes())
-            self._patience = max(FEW_MORE, *(entry.point.iterations for entry in done)) if best.converged else None
+            more = FEW_MORE_LEARNT if self._limited else FEW_MORE
+            self._patience = max(more, *(entry.point.iterations for entry in done)) if best.converged else None
             point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
             found = self._judged(nlp, point, parameters, again=True)
             # magnitudes that vanish with the cost leave nothing to compare it with, but the point before
             better = best.converged and _left(found) <= HELPED * _left(best)
             done.append(replace(found, converged=found.converged or better))
             idle += point.iterations == 0
+        if kept is not None:  # what has converged in a program is solved again in that
+            self.__dict__.update(kept)
         if not done[-1].settled:
             done.append(done.pop(done.index(_best(done))))
         return done
+
+    def _made(self) -> dict[str, Any]:
+        """What was made of the present program."""
+        return {name: getattr(self, name) for name in self._OF_PROGRAM}
 
     def _tighten(self, found: Residuals) -> None:
         """Ask more of the runs that follow.
@@ -201,7 +214,7 @@ class Runs:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
         where = point.where
         status = self._ending(point.status)
-        if not (point.success or (status is not None and status.judged)):
+        if not (point.success or (status is not None and status.judged) or self._ran_out()):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False, settled=False)
         first = self._first_order()
         found = residuals(first, point, parameters, where, None)
@@ -217,6 +230,10 @@ class Runs:
         converged = found.hold(self._limit) or found.hold_of_changes(self._limit)
         settled = found.settle(self._limit)
         return Round(nlp=nlp, point=point, where=where, residuals=found, converged=converged, settled=settled)
+
+    def _ran_out(self) -> bool:
+        """Whether the last run took all the iterations that a point which has converged may be left for."""
+        return self._patience is not None and self._monitor is not None and self._monitor.spent
 
     def _rescaled(
         self, last: Round, first: Program, parameters: Arrays, dual: bool, given: bool
@@ -475,8 +492,10 @@ def _left(entry: Round) -> float:
 
 def _helped(rounds: list[Round]) -> bool:
     """Whether the last run left less than the ones before, or did not move at all, so that more is to be asked."""
-    if len(rounds) == 1 or rounds[-1].point.iterations == 0:
+    if len(rounds) == 1:
         return True
+    if rounds[-1].point.iterations == 0:
+        return rounds[-2].point.iterations > 0
     return _left(rounds[-1]) <= HELPED * _left(_best(rounds[:-1]))
 
 

@@ -113,6 +113,8 @@ def _resolved(statement: Statement, options: Options, parameters: Array) -> Mesh
 class ReducedRuns(Runs):
     """Runs of the sequence of subproblems in place of those of an NLP solver of CasADi."""
 
+    _OF_PROGRAM = (*Runs._OF_PROGRAM, "_unit")
+
     def __init__(self, statement: Statement, mesh: Mesh, tolerance: float, most: int) -> None:
         """Keep the settings; see `prepare`."""
 

@@ -197,3 +197,12 @@ def test_an_attitude_times_a_vector_turns_it(kind):
     after, before = (value.full().ravel() for value in turned([0.5, 0.5, 0.5, 0.5]))
     assert after == pytest.approx([2.0, 3.0, 1.0])
     assert before == pytest.approx([3.0, 1.0, 2.0])
+
+
+def test_an_attitude_times_something_else():
+    _, attitude = declared()
+    row = ca.Function("row", [attitude.quaternion], [np.array([1.0, 2.0, 3.0]) @ attitude])
+    assert row([0.5, 0.5, 0.5, 0.5]).full().ravel() == pytest.approx([3.0, 1.0, 2.0])
+    for factor in (2.0, [1.0, 2.0], "north"):
+        with pytest.raises(co.ProblemError):
+            attitude @ factor

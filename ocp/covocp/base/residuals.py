@@ -9,7 +9,7 @@ reached: by how much would the cost J change, to first order, if
 - each violated constraint were met exactly (`infeasibility`),
 
 all relative to the cost. The gain still to be had is of the order of the square of the first of them, but all of the
-second: for a convex problem the cost is above the least one by no more than that, and often by as much.
+second: a convex cost whose slopes are zero is above the least one by no more than that, and often by as much.
 
 A cost that vanishes (tracking) has no size of its own. What the variables change of it by their magnitudes is one, but
 no measure of what can still be had: beside a terminal penalty of 1e6 it is 1e6 times the cost. So a point has to meet
@@ -43,8 +43,10 @@ STEEP = 1e-3
 # Slope, resolved and as large beside the cost, from which on more than a small share of the cost may be had; costs that
 # are none, whose slopes are none either.
 TOO_STEEP, NOTHING = 0.1, 1e-24
-# Complementarity that a solver could not make less and that is told, and what it is among the counts of a solution.
-LEFT, MUCH_LEFT = "complementarity_left", 1e-4
+# What a solver could not make less, among the counts of a solution, and from which on it is told: of slopes the square
+# is what can be had.
+BOUNDS_LEFT, SLOPES_LEFT = "complementarity_left", "stationarity_left"
+MUCH_LEFT = {BOUNDS_LEFT: 1e-4, SLOPES_LEFT: 3e-2}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,10 +99,23 @@ class Residuals:
         return replace(self, slope=slope, complementarity=apart, infeasibility=missed, size=size, varied=0.0)
 
     def settle(self, limit: float) -> bool:
-        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is."""
+        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is.
+
+        Beside a cost that vanishes nothing more can be had that counts.
+        """
         slope, *others = self._resolved
         gentle = slope <= max(STEEP, limit) and all(part <= limit for part in others)
-        return self.hold(limit) or (gentle and self.hold_of_changes(limit))
+        return self.hold(limit) or ((gentle or self.vanishes) and self.hold_of_changes(limit))
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether the cost is none beside what the variables change of it."""
+        return self.varied > 0.0 and self.size <= NO_SIZE * self.varied
+
+    @property
+    def left(self) -> dict[str, float]:
+        """What a point that does not settle leaves, relative to the cost, as it is told: by bounds, by slopes."""
+        return {BOUNDS_LEFT: self.complementarity, SLOPES_LEFT: self._resolved[0]}
 
     @property
     def too_steep(self) -> bool:

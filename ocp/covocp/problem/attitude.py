@@ -48,12 +48,38 @@ class Attitude:
         return ca.MX(so3.log(self.matrix))
 
     def __matmul__(self, other: Given) -> ca.MX:
-        """C times a vector or matrix, as `attitude.matrix @ other`."""
-        return ca.MX(self.matrix @ other)
+        """C times a vector or matrix of three rows, as `attitude.matrix @ other`.
+
+        Raises:
+            ProblemError: of another shape.
+        """
+        return ca.MX(ca.mtimes(self.matrix, self._factor(other, row=False)))
 
     def __rmatmul__(self, other: Given) -> ca.MX:
-        """A matrix times C, as `other @ attitude.matrix`."""
-        return ca.MX(ca.mtimes(other, self.matrix))
+        """A row or matrix of three columns times C, as `other @ attitude.matrix`.
+
+        Raises:
+            ProblemError: of another shape.
+        """
+        return ca.MX(ca.mtimes(self._factor(other, row=True), self.matrix))
+
+    def _factor(self, other: Given, *, row: bool) -> ca.MX:
+        """What the rotation is multiplied with; what has one axis is a row before it, a column behind it."""
+        if isinstance(other, Attitude):
+            return other.matrix
+        sizes = (*np.shape(other), 1, 1) if not hasattr(other, "shape") else (*other.shape, 1, 1)
+        factor = as_expression(self.name, "factor", other, (int(sizes[0]), int(sizes[1])))
+        if row and len(sizes) == 3:
+            factor = factor.T
+        if factor.shape[1 if row else 0] != 3:
+            side = "columns" if row else "rows"
+            raise ProblemError(
+                f"The attitude '{self.name}' is multiplied with something of another shape.",
+                expected=f"three {side}",
+                received=f"shape {tuple(factor.shape)}",
+                remedy="an attitude turns vectors of three entries",
+            )
+        return factor
 
     def error(self, reference: Given) -> ca.MX:
         """The rotation vector, in body axes, by which the attitude differs from another one, shape (3, 1) [rad].
