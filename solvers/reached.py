@@ -21,6 +21,8 @@ from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
 SMALLEST_SHARE = 1e-6
+# Share of its scale below which a state that was reached is at rest: nothing else is measured in that.
+NO_SHARE = 1e-5
 # Powers of ten by which scales may differ from those of the point that was reached.
 SIMILAR = 1.5
 # Relative displacement by which the curvature of the cost is measured.
@@ -178,6 +180,14 @@ def similar(nlp: Program, scales: Magnitudes) -> bool:
         time = np.array([new.duration / own.duration])
         ratios += [new.x / own.x, new.e / own.e, np.ravel(new.u / own.u), time]
     return bool(np.abs(np.log10(np.concatenate(ratios))).max(initial=0.0) <= SIMILAR)
+
+
+def vanished(before: Program, after: Program) -> bool:
+    """Whether some states or matrices are measured by what is left of them at rest, which before they were not."""
+    falls = [
+        np.concatenate([new.x / own.x, new.e / own.e]) for new, own in zip(after.scales, before.scales, strict=True)
+    ]
+    return bool(np.concatenate(falls).min(initial=1.0) < NO_SHARE)
 
 
 def carried(point: Point, old: Program, new: Program, *, dual: bool) -> Start:

@@ -32,6 +32,7 @@ from covocp.solvers.reached import (
     reached_scales,
     residuals,
     similar,
+    vanished,
 )
 from covocp.solvers.statuses import Status, status_of
 from covocp.transcription.program import Arrays, Program, Trajectories
@@ -163,7 +164,7 @@ class Runs:
         """
         done = [self._judged(nlp, first, parameters)]
         begun: tuple[Any, ...] = ()
-        idle, kept = 0, None
+        idle, made, kept = 0, self._made(), None
         while not done[-1].settled and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
             best = _best(done)
             if best.converged and not _helped(done):
@@ -173,21 +174,21 @@ class Runs:
             if best.converged and kept is None:
                 kept = self._made()
             given = len(done) < GIVEN_ROUNDS
-            nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best, given=given)
+            own, start = self._rescaled(best, nlp, parameters, dual=done[-1] is best, given=given)
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
-            if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
+            if self._open and ((done[-1] is best and own is best.nlp) or before == begun):
                 self._tighten(best.residuals if best.converged else best.residuals.of_changes())
             more = FEW_MORE_LEARNT if self._limited else FEW_MORE
             self._patience = max(more, *(entry.point.iterations for entry in done)) if best.converged else None
-            point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
-            found = self._judged(nlp, point, parameters, again=True)
+            point = self._run(own, self._solver(start.lam_x is not None), start, parameters, progress)
+            found = self._judged(own, point, parameters, again=True)
             # magnitudes that vanish with the cost leave nothing to compare it with, but the point before
             better = best.converged and _left(found) <= HELPED * _left(best)
             done.append(replace(found, converged=found.converged or better))
             idle += point.iterations == 0
-        if kept is not None:  # what has converged in a program is solved again in that
-            self.__dict__.update(kept)
+        kept = self._made() if kept is None else kept  # what has converged in a program is solved again in that
+        self.__dict__.update(made if vanished(nlp, kept["_nlp"]) else kept)
         if not done[-1].settled:
             done.append(done.pop(done.index(_best(done))))
         return done
