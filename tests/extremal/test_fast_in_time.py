@@ -228,7 +228,7 @@ def test_default_steps_see_a_profile_of_humps():
 
 
 def test_what_turns_a_few_times_is_known_by_its_operations():
-    """Polynomials of low degree, gravity, drag in an atmosphere and saturation, but no wave and nothing of many pieces."""
+    """Polynomials of low degree, gravity, drag in an atmosphere and saturation, no wave and nothing of many pieces."""
     s = ca.SX.sym("s", 3)
     x, v, a = ca.vertsplit(s)
     often = [ca.sin(x), ca.floor(x), logistic(x), *(symbols(x) for symbols, *_ in PROFILES.values())]

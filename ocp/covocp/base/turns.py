@@ -17,8 +17,10 @@ import casadi as ca
 MOST_READ = 5000
 # What neither rises nor falls more often, with two operands and with one.
 _LINEAR = ("ADD", "SUB", "NEG", "TWICE", "ASSIGN")
-_MONOTONE = ("EXP", "LOG", "SQRT", "POW", "CONSTPOW", "ASIN", "ACOS", "ATAN", "ERF", "ERFINV", "SINH", "COSH", "TANH")
-_MONOTONE += ("ASINH", "ACOSH", "ATANH", "LOG1P", "EXPM1", "HYPOT", "ATAN2", "INV")
+_MONOTONE = (
+    "EXP", "LOG", "SQRT", "POW", "CONSTPOW", "ASIN", "ACOS", "ATAN", "ERF", "ERFINV", "SINH", "COSH", "TANH", "ASINH",
+    "ACOSH", "ATANH", "LOG1P", "EXPM1", "HYPOT", "ATAN2", "INV",
+)  # fmt: skip
 # What ends where its operand, or the difference of both, changes its sign: constant beside that, or not.
 _STEPS = ("LT", "LE", "EQ", "NE", "SIGN", "COPYSIGN")
 _BENDS = ("FABS", "FMIN", "FMAX")
