@@ -65,14 +65,15 @@ def row_units(statement: Statement, conditions: Conditions, scales: Scales, shar
     looks = _Looks(statement, conditions, scales)
     with np.errstate(all="ignore"):
         beside = np.array([looks.beside(share) for share in shares])
-        least = ACCURATE * np.max([looks.varied(share) for share in shares], axis=0)
+        moved = np.array([looks.varied(share) for share in shares])
+        least = ACCURATE * moved.max(axis=0)
         capped = np.minimum(beside, np.maximum([looks.known(share) for share in shares], least))
         varied = np.max([looks.varied(share, around=True) for share in shares], axis=0)
     there = beside > ROUNDOFF * beside.max(axis=0)
     largest = np.where(there, capped, 0.0).max(axis=0)
     smallest = np.where(there, capped, np.inf).min(axis=0)
-    # a large unit lets much pass: it is one only of what is large at all times
-    size = np.where(largest > LARGE, np.maximum(smallest, 1.0), largest)
+    # it may be met where it is least; there, where that is nothing by chance, the variables tell how small that is
+    size = np.maximum(smallest, np.maximum(np.minimum(largest, moved.min(axis=0)), ACCURATE * largest))
     units = np.where(silent & (largest > 0), limit_units(size, size), units)
     return np.where(silent & (largest == 0) & (varied > 0) & (varied < 1.0 / SILENT), varied, units)
 
