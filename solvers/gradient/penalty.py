@@ -26,9 +26,9 @@ from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.influence import Run
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
+from covocp.transcription.limit_units import limit_units
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
-from covocp.transcription.scales import limit_units
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import at_nodes
 

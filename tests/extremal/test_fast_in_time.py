@@ -10,8 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.base.turns import may_turn_often
 from covocp.extremal.mesh_error import node_error
-from covocp.extremal.unseen import changes_within_steps
+from covocp.extremal.unseen import FEW, changes_within_steps
 
 DURATION, INTERVALS = 10.0, 50
 
@@ -149,6 +150,94 @@ def test_an_optimum_with_a_clock_is_that_with_the_time():
     by_time = co.solve(shaken(20.0), intervals=INTERVALS, progress=False)
     assert found.cost == pytest.approx(by_time.cost, rel=1e-6)
     assert abs(found["x"][-1] - flown(found, 20.0)) < 1e-3 * np.ptp(found["x"])
+
+
+def folded(x):
+    """A triangle wave of 256 straight pieces in [0, 1], by |x| of |x|."""
+    for _ in range(8):
+        x = 1 - abs(1 - 2 * x)
+    return x
+
+
+def logistic(x):
+    """A polynomial of degree 256 that keeps in [0, 1], turning 255 times."""
+    for _ in range(8):
+        x = 4 * x * (1 - x)
+    return x
+
+
+def chosen(x):
+    """Zeros and ones by turns, 200 of them, as CasADi chooses them."""
+    s = ca.SX.sym("s")
+    values = ca.pw_const(s, ca.DM(np.arange(0.5, 200) / 20), ca.DM(np.arange(201) % 2.0))
+    return ca.Function("chosen", [s], [values])(x)
+
+
+# In symbols and in numbers, over [0, 10], with the number of intervals whose regular places miss them.
+PROFILES = {
+    "humps": (
+        lambda x: sum(ca.exp(-(((x - 0.1 * k - 0.05) / 0.02) ** 2)) for k in range(100)),
+        lambda x: sum(np.exp(-(((x - 0.1 * k - 0.05) / 0.02) ** 2)) for k in range(100)),
+        25,
+    ),
+    "triangles": (lambda x: folded(x / 10), lambda x: folded(x / 10), 32),
+    "a table of choices": (
+        chosen,
+        lambda x: np.floor(20 * x + 0.5) % 2.0,
+        25,
+    ),
+    "pulses": (
+        lambda x: sum(ca.if_else(ca.fabs(x - 0.2 * k - 0.05) < 0.03, 1, 0) for k in range(50)),
+        lambda x: (np.abs(5 * x - np.floor(5 * x) - 0.25) < 0.15) * 1.0,
+        25,
+    ),
+}
+
+
+def driven(profile):
+    """A lag driven over a profile at constant speed, and what it comes to by quadrature, along u(t)."""
+    symbols, numbers, intervals = PROFILES[profile]
+    ocp = co.Problem(1.0)
+    place, w, u = ocp.state("place", initial=0.0), ocp.state("w", initial=0.0), ocp.control("u")
+    ocp.dynamics(place, 10.0)
+    ocp.dynamics(w, 10 * symbols(place) - w + u)
+    ocp.minimize(running=u**2, terminal=(w - 1) ** 2)
+    t = (np.arange(100_000) + 0.5) / 100_000
+
+    def truth(solution):
+        return float(np.mean(np.exp(-(1 - t)) * (10 * numbers(10 * t) + np.interp(t, solution.t, solution["u"]))))
+
+    return ocp, intervals, truth
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_of_many_pieces_along_a_state_is_told(profile):
+    """No wave is in these by which they would repeat themselves."""
+    problem, intervals, truth = driven(profile)
+    with pytest.warns(co.CovocpWarning, match="changes with the time faster than the integration steps see.*'w'"):
+        found = co.evaluate(problem, nominal={"u": 0.0}, intervals=intervals, substeps=1)
+    off = abs(found["w"][-1] - truth(found)) / max(np.ptp(found["w"]), 1e-3)
+    assert off > 0.5  # the steps take the profile for a constant
+    assert node_error(found.extremal) > 0.25 * off
+
+
+def test_default_steps_see_a_profile_of_humps():
+    problem, intervals, truth = driven("humps")
+    found = co.solve(problem, intervals=intervals, progress=False)
+    assert found["w"][-1] == pytest.approx(truth(found), rel=2e-3)
+
+
+def test_what_turns_a_few_times_is_known_by_its_operations():
+    """Polynomials of low degree, gravity, drag in an atmosphere and saturation, no wave and nothing of many pieces."""
+    s = ca.SX.sym("s", 3)
+    x, v, a = ca.vertsplit(s)
+    often = [ca.sin(x), ca.floor(x), logistic(x), *(symbols(x) for symbols, *_ in PROFILES.values())]
+    often.append(sum((-1) ** k * ca.tanh(9 * (x - k)) for k in range(20)))
+    seldom = [x**3 - v * a, -x / ca.norm_2(s) ** 3, ca.exp(-x) * v**2 * (1 + a**2), ca.fmin(ca.fmax(x, -1), 1)]
+    for expressions, expected in ((often, True), (seldom, False)):
+        for expression in expressions:
+            assert may_turn_often(ca.Function("f", [s], [expression]), FEW) is expected
+            assert not may_turn_often(ca.Function("f", [s], [expression]), FEW, constant=(0,))
 
 
 KNOTS = np.linspace(0.0, DURATION, 801)

@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.solving import solver
 
 INTERVALS = {"intervals": 80, "progress": False}
 
@@ -78,3 +79,28 @@ def test_a_condition_that_acts_beside_an_actuator_known_exactly_is_found(best):
     assert found.optimality.stationarity < 1e-6
     assert found.optimality.complementarity < 1e-5
     assert found.optimality.curvature >= 0
+
+
+def lag(weight, *, limit):
+    """An unstable lag that is brought to one; with a limit, a gain that is optimised, which the best one keeps."""
+    ocp = co.Problem(5.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.3), ocp.control("u")
+    ocp.dynamics(x, 0.5 * x + u, noise=0.05)
+    ocp.measurement("m", x, noise=0.02)
+    ocp.minimize_expected(running=weight * u**2, terminal_weight={x: 3.0 * weight})
+    if limit:
+        ocp.chance(x, upper=2.2, probability=0.9)
+    return ocp
+
+
+@pytest.mark.parametrize(("weight", "looks"), [(1.0, 0), (0.01, 1)])
+def test_a_solution_of_another_problem_is_not_taken_for_its_optimum(weight, looks, monkeypatch):
+    """A hundredth of the cost has the same names and way; that it is no saddle is known of the problem itself alone."""
+    looked, away = [], solver.away_from_saddle
+    monkeypatch.setattr(solver, "away_from_saddle", lambda *given: looked.append(1) or away(*given))
+    options = {"intervals": 25, "progress": False}
+    guess = co.solve(lag(weight, limit=False), **options)
+    looked.clear()
+    found = co.solve(lag(1.0, limit=True), guess=guess, **options)
+    assert len(looked) == looks
+    assert found.cost == pytest.approx(guess.cost / weight, rel=1e-4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from problems import solve
@@ -188,3 +189,45 @@ def test_a_variance_that_stands_beside_its_limit_is_met_from_a_large_prior(prior
         assert solution.trajectory.e[-1, -1] <= 0.01 * (1 + 1e-5)
         costs.append(solution.cost)
     assert costs[1] == pytest.approx(costs[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("at", ["final", "path"])
+@pytest.mark.parametrize("speed", [1e3, 1e7])
+def test_a_target_that_moves_is_met_where_it_is_at_the_end(speed, at):
+    """It is at 1 at the end, and far below all the time before: a straight way costs 1 / T."""
+    ocp = co.Problem(10.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2)
+    ocp.subject_to(x - (1.0 + speed * (ocp.time - 10.0)), lower=0.0, **({"at": "final"} if at == "final" else {}))
+    solution = solve(ocp, intervals=20)
+    assert solution.cost == pytest.approx(0.1, rel=1e-6)
+
+
+def around(center, written):
+    """The least cost of a way around a disc of radius 2 about some place, with the distance it keeps at the nodes."""
+    ocp = co.Problem(10.0)
+    x = ocp.state("x", 2, initial=[center - 5.0, center + 0.5], final=[center + 5.0, center + 0.5])
+    u = ocp.control("u", 2)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=ca.sumsqr(u))
+    value, lower = written(ca.sumsqr(x - center))
+    ocp.subject_to(value, lower=lower)
+    solution = solve(ocp, intervals=40)
+    return solution.cost, np.linalg.norm(solution["x"] - center, axis=1).min()
+
+
+@pytest.mark.parametrize(
+    ("center", "written"),
+    [
+        (0.0, lambda d: (1 - 4 / (d + 1e-6), 0.0)),
+        (0.0, lambda d: (1 - 4 / (d + 1e-9), 0.0)),
+        (1e4, lambda d: (d - 4.0, 0.0)),
+        (1e4, lambda d: (ca.sqrt(d) - 2.0, 0.0)),
+    ],
+)
+def test_what_a_row_is_where_it_never_comes_is_no_unit(center, written):
+    """Of the inverse of a distance at the center, of a distance at the origin of a map."""
+    cost, nearest = around(center, written)
+    assert nearest > 2.0 - 1e-3
+    assert cost == pytest.approx(around(0.0, lambda d: (d, 4.0))[0], rel=1e-4)

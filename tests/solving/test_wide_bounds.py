@@ -18,8 +18,9 @@ from problems import solve
 import covocp as co
 from covocp.solution.doubts import mention_doubts
 from covocp.statement.statement import Statement
+from covocp.transcription.limit_units import limit_units
 from covocp.transcription.mesh import Options
-from covocp.transcription.scales import AT_START, GIVEN_SHARE, choose_scales, limit_units, magnitudes
+from covocp.transcription.scales import AT_START, GIVEN_SHARE, choose_scales, magnitudes
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Trajectory

@@ -20,8 +20,6 @@ WHOLE = ("OP_FLOOR", "OP_CEIL", "OP_FMOD", "OP_REMAINDER")
 LOGICAL = ("OP_LT", "OP_LE", "OP_EQ", "OP_NE", "OP_AND", "OP_OR", "OP_NOT")
 # Operations by which a value may jump where a piece ends; what it is at a single point (==) is no piece.
 JUMPING = ("OP_LT", "OP_LE", "OP_SIGN", "OP_IF_ELSE_ZERO", "OP_COPYSIGN", "OP_ATAN2", *WHOLE)
-# Operations by which a value may repeat itself.
-REPEATING = ("OP_SIN", "OP_COS", "OP_TAN", *WHOLE)
 # How what is compared is written; with its operands.
 WRITTEN = {
     "OP_LT": "{} < {}", "OP_LE": "{} <= {}", "OP_SIGN": "sign({})", "OP_FLOOR": "floor({})", "OP_CEIL": "ceil({})",
@@ -137,33 +135,19 @@ def may_jump(function: ca.Function) -> bool:
 
     Tables do not jump.
     """
-    return _may_use(function, JUMPING, tables=False)
-
-
-def may_repeat(function: ca.Function) -> bool:
-    """Whether a function may rise and fall many times along a straight line: by waves, rounding, tables.
-
-    So may one of which it is not known what it does.
-    """
-    return _may_use(function, REPEATING, tables=True)
-
-
-def _may_use(function: ca.Function, operations: tuple[str, ...], *, tables: bool) -> bool:
-    """Whether some operations are in a function or in what it calls, or that is not known; `tables`: do these count."""
     if function.name().startswith(TABLE):
-        return tables
+        return False
     if not (function.is_a("SXFunction") or function.is_a("MXFunction")):
         return True
     codes = {function.instruction_id(k) for k in range(function.n_instructions())}
-    if not codes.isdisjoint(_codes(operations)):
+    if not codes.isdisjoint(_codes(JUMPING)):
         return True
     if ca.OP_CALL not in codes:
         return False
     if function.is_a("SXFunction"):  # it does not say which function that is
         return True
     places = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
-    called = (function.instruction_MX(k).which_function() for k in places)
-    return any(_may_use(inner, operations, tables=tables) for inner in called)
+    return any(may_jump(function.instruction_MX(k).which_function()) for k in places)
 
 
 def calls(function: ca.Function) -> bool:

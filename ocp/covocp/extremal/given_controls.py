@@ -13,9 +13,10 @@ from covocp.extremal.row_units import varied_by
 from covocp.statement.conditions import Conditions, Inside, beyond
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
+from covocp.transcription.limit_units import limit_units
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import Scales
-from covocp.transcription.scales import choose_scales, limit_units
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.shooting import single_shooting
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory

@@ -30,7 +30,8 @@ from covocp.solution.solution import Solution
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.entries import entry_names
 from covocp.statement.statement import Conditions, Statement
-from covocp.transcription.scales import limit_units, magnitudes
+from covocp.transcription.limit_units import limit_units
+from covocp.transcription.scales import magnitudes
 
 Place = Literal["path", "initial", "final", "inside"]
 # Limits count as kept within this share of their size.

@@ -12,7 +12,7 @@ from covocp.base.normal import inside, margin, shown_probability
 from covocp.base.pages import Section, Sentence, Table, number
 from covocp.base.residuals import PASSED
 from covocp.statement.chances import ChanceLimits
-from covocp.transcription.scales import limit_units
+from covocp.transcription.limit_units import limit_units
 
 if TYPE_CHECKING:
     from covocp.solution.solution import Solution

@@ -30,10 +30,20 @@ from covocp.transcription.trajectory import Multipliers
 PATIENCE = 60
 # The cost with conditions on X is no less than that without, but for other minima: so far below, as a share of it.
 BELOW = 0.5
+# Share by which costs differ where a best gain, which acts at every step, becomes one that is straight between nodes;
+# and share of the range of a state within which the nominal is the same then.
+SAME_COST, SAME_STATE = 1e-3, 1e-4
 
 
 def from_best(
-    statement: Statement, prepared: Prepared, parameters: Array, best: Solution, reporter: Progress, *, further: bool
+    statement: Statement,
+    prepared: Prepared,
+    parameters: Array,
+    best: Solution,
+    reporter: Progress,
+    *,
+    further: bool,
+    own: bool,
 ) -> tuple[Outcome, Guess, bool] | None:
     """The outcome from a solution with the best gain and its multipliers; None where they lead nowhere.
 
@@ -44,6 +54,7 @@ def from_best(
         best: solution with the best gain, perhaps with more or fewer conditions.
         reporter: of iterations.
         further: whether it is a start, too, where it does not keep the conditions.
+        own: whether it is one of this problem; one that was given may be of another that has its names.
 
     Returns:
         The outcome, where it began, and whether it is the optimum that `best` is.
@@ -61,7 +72,17 @@ def from_best(
     if reporter.stop and not outcome.converged:
         return outcome, start, kept
     lower = best.cost - BELOW * abs(best.cost)
-    return (outcome, start, kept) if outcome.converged and sum(outcome.cost_terms.values()) >= lower else None
+    if not outcome.converged or sum(outcome.cost_terms.values()) < lower:
+        return None
+    return outcome, start, kept and (own or _where(outcome, best))
+
+
+def _where(outcome: Outcome, best: Solution) -> bool:
+    """Whether an outcome is where a solution was: that of a problem of other dynamics, noises or cost is elsewhere."""
+    cost, x, known = sum(outcome.cost_terms.values()), outcome.extremal.trajectory.x, best.trajectory.x
+    sizes = np.maximum(np.ptp(known, axis=0), np.abs(known[0]))
+    near = bool((np.abs(x - known).max(axis=0, initial=0.0) <= SAME_STATE * sizes).all())
+    return near and abs(cost - best.cost) <= SAME_COST * abs(best.cost)
 
 
 def part(reporter: Progress, iterations: int | None, best: Solution, *, floor: bool = True) -> Progress:

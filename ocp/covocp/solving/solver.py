@@ -281,8 +281,9 @@ class Solver:
             self._look_at_steps(values)
         found = None
         if isinstance(guess, Solution):
-            further = first is guess and self._by_ipopt
-            found = from_best(self._solved, self._prepared, values, guess, reporter, further=further)
+            own = first is guess
+            further = own and self._by_ipopt
+            found = from_best(self._solved, self._prepared, values, guess, reporter, further=further, own=own)
         if found is not None and found[2]:  # the optimum with the best gain: nobody looks for another one beside it
             return found[0], first
         try:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices, unpack
-from covocp.statement.interval import model_symbols
-from covocp.statement.statement import Block, Conditions, Statement
-from covocp.transcription.covariance_steps import KEPT
+from covocp.statement.statement import Block, Statement
 from covocp.transcription.first_guess import evaluate_guess, simulated
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
@@ -43,62 +38,6 @@ WIDE_BOUNDS = 1e3
 NOTHING = 1e-50
 # A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
 ROUNDOFF = 1e-24
-# Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
-SMALL, LARGE = 0.1, 1e3
-# Limits of zero tell no unit: it is one, unless the rows vary by so many times less or more.
-SILENT = 1e3
-
-
-def limit_units(lower: Array, upper: Array) -> Array:
-    """Units of rows between limits: the larger one where it is small, the nearer one to zero where it is large, else 1.
-
-    A large limit beside one that is not (-1e9 <= v <= 0.3, 0 <= v <= 1e9) says nothing of what it limits.
-    """
-    limits = np.abs(np.stack([lower, upper]))
-    nearest = np.where(np.isfinite(limits), limits, np.inf).min(axis=0)
-    largest = np.where(limits <= LARGE, limits, 0.0).max(axis=0)
-    large = np.isfinite(nearest) & (nearest > LARGE)
-    return np.where((largest > 0) & (largest < SMALL), largest, np.where(large, nearest, 1.0))
-
-
-def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> Array:
-    """Units of the rows of conditions: those of their limits; where these are zero of what is beside the variables.
-
-    That is what a row is where all variables are zero: E - 0.01 <= 0 is E <= 0.01. Where that is zero too it is what
-    the row varies by, to first order, if all variables change by their magnitudes, where this is below 1 / `SILENT`.
-
-    Args:
-        statement: the problem.
-        conditions: of it.
-        scales: magnitudes of its variables.
-    """
-    lower, upper = conditions.lower, conditions.upper
-    units = limit_units(lower, upper)
-    silent = ~(np.isfinite(lower) & (lower != 0)) & ~(np.isfinite(upper) & (upper != 0))
-    if not silent.any():
-        return units
-    sizes = scales.x, np.atleast_2d(scales.u).max(axis=0), scales.e
-    beside, varied = np.zeros(silent.size), np.zeros(silent.size)
-    with np.errstate(all="ignore"):
-        for side in (1.0, 0.0, -1.0):
-            at = [side * size for size in sizes]
-            others = (0.5 * (1.0 + side) * scales.duration, scales.duration, statement.values)
-            found = _variation(statement, conditions.function)(*at, *others, *sizes)
-            varied = np.fmax(varied, np.where(np.isfinite(own := np.asarray(found.full()).ravel()), own, 0.0))
-            found = conditions.function(*(0.0 * size for size in sizes), *others)
-            beside = np.fmax(beside, np.where(np.isfinite(own := np.abs(found.full()).ravel()), own, 0.0))
-    units = np.where(silent & (beside > 0), limit_units(beside, beside), units)
-    return np.where(silent & (beside == 0) & (varied > 0) & (varied < 1.0 / SILENT), varied, units)
-
-
-@lru_cache(maxsize=KEPT)
-def _variation(statement: Statement, function: ca.Function) -> ca.Function:
-    """(arguments of conditions, magnitudes of x, u and e) -> what each row varies by if all change by these."""
-    symbols = model_symbols(statement)
-    kind: Any = statement.symbolic
-    sizes = [kind.sym(name, size) for name, size in (("dx", statement.nx), ("du", statement.nu), ("de", statement.ne))]
-    varied = ca.fabs(ca.jacobian(function(*symbols), ca.vertcat(*symbols[:3]))) @ ca.vertcat(*sizes)
-    return ca.Function("variation", [*symbols, *sizes], [ca.densify(varied)])
 
 
 def magnitudes(

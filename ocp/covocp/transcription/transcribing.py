@@ -16,10 +16,10 @@ from covocp.passage.sweep import depends, passed_by
 from covocp.passage.written import Tape
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
+from covocp.transcription.limit_units import ALONG, row_units
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.pieces import is_separable, pieces
-from covocp.transcription.scales import row_units
 from covocp.transcription.sequences import Passage
 from covocp.transcription.shooting import backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
 from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
@@ -170,21 +170,22 @@ def _constraints(
         at_nodes = ca.MX(0, n)
     time = variables.duration * ca.DM(mesh.nodes).T
     arguments = (nodes["x"], at_nodes, nodes["e"], time)
-    places: Mapping[str, tuple[Conditions, list[int]]] = {
-        "path": (statement.path, list(range(n))),
-        "start": (statement.start, [0]),
-        "end": (statement.end, [n - 1]),
+    places: Mapping[str, tuple[Conditions, list[int], tuple[float, ...]]] = {
+        "path": (statement.path, list(range(n)), ALONG),
+        "start": (statement.start, [0], (0.0,)),
+        "end": (statement.end, [n - 1], (1.0,)),
     }
-    for kind, (conditions, columns) in places.items():
+    for kind, (conditions, columns, shares) in places.items():
         if conditions.size:
             k = len(columns)
             x, u, e, t = (v[:, columns] for v in arguments)
             value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
-            rows.append(_condition_rows(kind, conditions, value, k, mesh, row_units(statement, conditions, scales)))
+            units = row_units(statement, conditions, scales, shares)
+            rows.append(_condition_rows(kind, conditions, value, k, mesh, units))
     for i, (part, k) in enumerate(zip(statement.inside.parts, statement.inside.nodes_among(mesh.nodes), strict=True)):
         at = Columns(*(v[:, k] for v in arguments))
         value = part.conditions.columns(at, variables.duration, variables.parameters)
-        units = row_units(statement, part.conditions, scales)
+        units = row_units(statement, part.conditions, scales, (part.place,))
         rows.append(_condition_rows(inside_kind(i), part.conditions, value, 1, mesh, units))
     if mesh.points > 1:
         rows += _inside_rows(statement, mesh, scales, variables, nodes)
