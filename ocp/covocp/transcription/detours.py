@@ -22,7 +22,7 @@ from covocp.transcription.sides import pushes, stretches
 from covocp.transcription.steering import Run
 
 # Runs that are pushed to some side until there is a way, and after that, and ways that are kept, at most.
-TRIES, MORE, KEPT = 40, 16, 3
+TRIES, MORE, KEPT = 40, 10, 3
 # What may be left of the conditions, in their sizes, and of the final values.
 LEFT = 0.05
 # Scales of states are no smaller than this share of what they can be moved by.
