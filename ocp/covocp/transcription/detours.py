@@ -116,12 +116,17 @@ class _Search:
             self.added += 1
             heapq.heappush(self.queue, (*detour.rank, self.added, detour))
 
-    def beside(self, detour: Detour) -> list[Detour]:
-        """The run pushed to the sides of what it runs through deepest, as far as that is new and tries are left."""
+    def beside(self, detour: Detour, *, diving: bool = False) -> list[Detour]:
+        """The run pushed to the sides of what it runs through deepest, as far as that is new and tries are left.
+
+        On the way to a first one, two sides of each condition are all where four of each were more tries than are left.
+        """
         place = _deepest(detour)
         if place is None or self.left <= 0:
             return []
         sides = pushes(detour.along, *place, self.task.fixed)
+        if diving and len(sides) * _conditions(detour) > self.left:
+            sides = sides[:2]
         self.left -= max(1, len(sides))
         following = []
         for child in _beside(detour, *place, sides, self.task):
@@ -135,7 +140,7 @@ class _Search:
         """Go on from the cheapest run, and from the cheapest one beside it, to some way: where many are in the way."""
         best = heapq.heappop(self.queue)[-1] if self.queue else None
         while best is not None:
-            following = sorted(self.beside(best), key=lambda one: one.rank)
+            following = sorted(self.beside(best, diving=True), key=lambda one: one.rank)
             if _deepest(best) is None:
                 self.add(best)
             for other in following[1:]:
@@ -215,6 +220,12 @@ def _deepest(detour: Detour) -> tuple[int, NDArray[np.intp]] | None:
         return None
     depths = along.excess[:, :m] / along.magnitudes[:m]
     return max(found, key=lambda one: float(depths[one[1], one[0]].max()))
+
+
+def _conditions(detour: Detour) -> int:
+    """How many are violated and have not been cleared."""
+    m = detour.along.run.statement.path.size
+    return int((detour.along.violated[:, :m] & ~detour.meant[:, :m]).any(axis=0).sum())
 
 
 def _beside(detour: Detour, row: int, nodes: NDArray[np.intp], sides: list[Push], task: Clearing) -> list[Detour]:
