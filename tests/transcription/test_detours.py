@@ -99,6 +99,65 @@ def test_a_tree_between_the_straight_line_and_the_bent_start():
     assert solve(problem, intervals=50).cost == pytest.approx(LENGTH**2 / TIME, rel=1e-6)
 
 
+def shortest_between(start: list[float], goal: list[float], centre: list[float], radius: float) -> float:
+    """Length of the shortest way round a circle: two tangents and an arc on the near side."""
+    from_start, from_goal = np.subtract(start, centre), np.subtract(goal, centre)
+    a, b = np.linalg.norm(from_start), np.linalg.norm(from_goal)
+    arc = np.arccos(from_start @ from_goal / a / b) - np.arccos(radius / a) - np.arccos(radius / b)
+    return float(np.sqrt(a**2 - radius**2) + np.sqrt(b**2 - radius**2) + radius * arc)
+
+
+@pytest.mark.parametrize(("aside", "centre", "radius"), [(0.3, 1.5, 2.0), (0.5, -1.5, 2.0), (-0.1, -1.5, 2.0)])
+@pytest.mark.parametrize("kind", ["vector", "numbers", "in other units"])
+def test_the_goal_lies_a_little_aside(aside, centre, radius, kind):
+    """How far the goal lies aside says nothing of how far the way round is; nor need coordinates have one unit."""
+    unit = 1e3 if kind == "in other units" else 1.0
+    problem = co.Problem(duration=TIME, name=kind)
+    if kind == "vector":
+        place = problem.state("p", 2, initial=[0.0, 0.0], final=[LENGTH, aside])
+        u = problem.control("u", 2)
+        problem.dynamics(place, u)
+    else:
+        x, y = problem.state("x", initial=0.0, final=LENGTH), problem.state("y", initial=0.0, final=aside / unit)
+        u = problem.control("u", 2)
+        problem.dynamics(x, u[0])
+        problem.dynamics(y, u[1] / unit)
+        place = ca.vertcat(x, y * unit)
+    problem.minimize(running=ca.sumsqr(u))
+    problem.subject_to(apart(place, 5.0, centre), lower=radius**2, name="tree")
+    cost = shortest_between([0.0, 0.0], [LENGTH, aside], [5.0, centre], radius) ** 2 / TIME
+    assert solve(problem, intervals=40).cost == pytest.approx(cost, rel=3e-3)
+
+
+def test_in_the_coordinates_of_a_map():
+    """Far from their origin the distances of a run have few digits left, at its end none."""
+    origin, goal = 1e5, LENGTH
+    problem = co.Problem(duration=TIME, name="map")
+    x = problem.state("x", 2, initial=[origin, origin], final=[origin + goal, origin])
+    u = problem.control("u", 2)
+    problem.dynamics(x, u)
+    problem.minimize(running=ca.sumsqr(u))
+    problem.subject_to(ca.sqrt(apart(x, origin + 5.0, origin + 0.5)), lower=RADIUS, name="tree")
+    assert solve(problem, intervals=40).cost == pytest.approx(shortest(0.5) ** 2 / TIME, rel=3e-3)
+
+
+def test_a_goal_inside_what_is_forbidden_is_refused():
+    problem, x, _ = walk()
+    problem.subject_to(apart(x, LENGTH, 0.5), lower=1.0, name="tree")
+    with pytest.raises(co.SolveError, match="tree"):
+        solve(problem, intervals=30)
+
+
+def test_numbers_without_a_value_end_no_solve(monkeypatch):
+    def fails(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(ranked_starts, "detours", fails)
+    problem, x, _ = walk()
+    problem.subject_to(apart(x, 5.0, 1.0), lower=RADIUS**2)
+    assert solve(problem, intervals=30).converged
+
+
 # --- several obstacles, other vehicles: the best of many guesses ------------------------------------------------------
 
 TREES = [(2.6, 0.4, 1.0), (5.2, -0.5, 1.1), (7.6, 0.45, 0.9)]
@@ -135,6 +194,55 @@ def test_among_three_trees_as_cheap_as_the_best_of_all_sides(kind):
         costs += [other.cost] if other.converged else []
     assert solver.solve(progress=False, assess=False).cost <= 1.001 * min(costs)
     assert max(costs) > 1.05 * min(costs)
+
+
+def test_a_unicycle_beside_several_trees_as_cheap_as_the_best_of_many_guesses():
+    """The ways that are pushed must not displace the start that led to the cheapest one."""
+    problem = co.Problem(duration=TIME, name="unicycle")
+    goal = [LENGTH, -1.204]
+    x = problem.state("x", 2, initial=[0.0, 0.0], final=goal)
+    heading, u = problem.state("heading", initial=0.0), problem.control("u")
+    problem.dynamics(x, 1.3 * ca.vertcat(ca.cos(heading), ca.sin(heading)))
+    problem.dynamics(heading, u)
+    problem.minimize(running=u**2)
+    for a, b, radius in [(5.919, 1.737, 1.586), (7.109, 1.515, 0.557), (5.645, 1.457, 1.025), (3.977, 1.913, 1.377)]:
+        problem.subject_to(apart(x, a, b), lower=radius**2)
+    solver, costs = co.Solver(problem, intervals=30), []
+    for bow in (-4.0, -2.0, 2.0, 4.0):
+        guess = {"x": [[0.0, 0.0], [3.0, bow], [6.0, bow], goal]}
+        other = solver.solve(guess=guess, progress=False, assess=False, allow_failure=True, iteration_limit=60)
+        costs += [other.cost] if other.converged else []
+    assert solver.solve(progress=False, assess=False).cost <= 1.001 * min(costs)
+
+
+def exchange(count: int) -> co.Problem:
+    """Points on a circle that exchange their places across it, a metre apart."""
+    problem, xs, us = co.Problem(duration=TIME, name="exchange"), [], []
+    for angle in np.arange(count) * 2 * np.pi / count:
+        place = 5.0 * np.array([np.cos(angle), np.sin(angle)])
+        xs.append(problem.state(f"x{len(xs)}", 2, initial=place, final=-place))
+        us.append(problem.control(f"u{len(us)}", 2))
+        problem.dynamics(xs[-1], us[-1])
+    problem.minimize(running=sum(ca.sumsqr(u) for u in us))
+    for i, x in enumerate(xs):
+        for other in xs[:i]:
+            problem.subject_to(ca.sumsqr(x - other), lower=1.0)
+    return problem
+
+
+@pytest.mark.filterwarnings("ignore:Between the points where it is imposed")
+def test_four_points_exchange_their_places_at_no_more_than_on_a_roundabout():
+    """Whose neighbours are a metre apart; coordinates that end at zero but for rounding are missed by no run."""
+    around = 4 * shortest_between([-5.0, 0.0], [5.0, 1e-9], [0.0, 0.0], np.sqrt(0.5)) ** 2 / TIME
+    assert solve(exchange(4), intervals=30).cost <= 1.002 * around
+
+
+@pytest.mark.filterwarnings("ignore:Between the points where it is imposed")
+def test_five_points_find_a_way_among_ten_conditions():
+    """On a roundabout next neighbours are a metre apart; ways that are no roundabout may be cheaper."""
+    radius = 0.5 / np.sin(np.pi / 5)
+    around = 5 * shortest_between([-5.0, 0.0], [5.0, 1e-9], [0.0, 0.0], radius) ** 2 / TIME
+    assert solve(exchange(5), intervals=20).cost <= 1.02 * around
 
 
 def test_the_later_of_two_phases_passes_on_the_near_side():

@@ -155,6 +155,7 @@ class Guess:
         scales: units of a program that is made for it; None: chosen by the trajectory.
         held: whether a feedback holds an unstable nominal along it, which need not be the way.
         rival: whether it is one of several ways round what may not be entered: the cheapest that comes of them counts.
+        about: what a rival is thought to cost, NaN where nothing tells.
     """
 
     trajectory: Trajectory
@@ -165,5 +166,6 @@ class Guess:
     scales: Scales | None = None
     held: bool = False
     rival: bool = False
+    about: float = np.nan
 
     __repr__ = short_repr

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from covocp.base.errors import Interrupted, OutsideDomainError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.solution.phases import PhasesSolution
@@ -20,17 +22,21 @@ AnyOutcome = Outcome | ChainOutcome
 Found = TypeVar("Found", Outcome, Solution)
 # Starts that are tried where a method loses its way.
 TRIED = 4
+# A run has come to where a rival begins if the states differ nowhere by more than this share of how far they move.
+APART = 0.05
+# A rival costs what it was thought to, up to this share.
+TOLD = 0.01
 
 
 def from_starts(
     prepared: Prepared, values: Array, guesses: Iterable[Guess], reporter: Progress
 ) -> tuple[Outcome, Guess]:
-    """Solve from the first start from which the method finds its way.
+    """Solve from the first start from which the method finds its way, and from its rivals: the cheapest counts.
 
     A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
     all of them, the first run counts: it is made again, and not stopped, where it was stopped. Where a run fails from a
-    start that a feedback holds, there is another one that is left to itself. Of rivals, which come first, the cheapest
-    outcome counts.
+    start that a feedback holds, there is another one that is left to itself. Rivals, which come first among the
+    guesses, are tried after the first start, but for those to whose way that has led already.
 
     Returns:
         The outcome, and the start from which it came.
@@ -38,42 +44,109 @@ def from_starts(
     Raises:
         OutsideDomainError: no start lies within the domain of the model (says what the first one lacks).
     """
-    tried: list[tuple[Outcome, Guess]] = []
-    refused: list[OutsideDomainError] = []
-    best: tuple[Outcome, Guess] | None = None
-    others = 0
-    for guess in guesses:
-        others += not guess.rival
-        if others > TRIED or (best is not None and others):
+    runs = _Runs(prepared=prepared, values=values, reporter=reporter)
+    rivals, others = _parted(guesses)
+    for count in range(TRIED):
+        guess = next(others, None)
+        more = guess is not None and runs.goes_on(guess)
+        if count == 0:
+            runs.compare(rivals)
+        if not more or reporter.stop or runs.trusted:
             break
+    return runs.best()
+
+
+def _as_told(outcome: Outcome, rival: Guess) -> bool:
+    """Whether an outcome costs what a rival was thought to."""
+    return bool(abs(cost_of(outcome) - rival.about) <= TOLD * abs(rival.about))
+
+
+def _parted(guesses: Iterable[Guess]) -> tuple[list[Guess], Iterator[Guess]]:
+    """The rivals, which come first, and the other starts, which are made when they are asked for."""
+    rest = iter(guesses)
+    rivals: list[Guess] = []
+    for guess in rest:
+        if not guess.rival:
+            return rivals, chain([guess], rest)
+        rivals.append(guess)
+    return rivals, rest
+
+
+@dataclass(kw_only=True)
+class _Runs:
+    """Runs of a method from several starts."""
+
+    prepared: Prepared
+    values: Array
+    reporter: Progress
+    tried: list[tuple[Outcome, Guess]] = field(default_factory=list)
+    refused: list[OutsideDomainError] = field(default_factory=list)
+
+    trusted: bool = False
+
+    __repr__ = short_repr
+
+    def run(self, guess: Guess) -> Outcome | None:
+        """The outcome from a start; None where that lies outside the domain of the model."""
         try:
-            outcome = prepared.solve(values, replace(guess, tentative=not guess.warm), reporter)
+            outcome = self.prepared.solve(self.values, replace(guess, tentative=not guess.warm), self.reporter)
         except OutsideDomainError as error:
-            refused.append(error)
-            continue
-        tried.append((outcome, guess))
-        if outcome.converged and guess.rival and not reporter.stop:
-            best = min(best or tried[-1], tried[-1], key=lambda one: cost_of(one[0]))
-        elif reporter.stop or (not guess.rival and (outcome.converged or not _goes_on(outcome, guess))):
-            break
-    if best is not None:
-        return _with_all(best[0], [one for one, _ in tried]), best[1]
-    if not tried:
-        raise refused[0]
-    outcome, guess = tried[-1]
-    if not outcome.converged and tried[0][1].held and not tried[0][0].stats.get("wandered"):
-        outcome, guess = tried[0]
-    elif not outcome.converged and outcome.stats.get("wandered") and not reporter.stop:
-        guess = tried[0][1]
-        outcome = prepared.solve(values, guess, reporter)
-    if len(tried) > 1:
-        outcome = replace(outcome, stats={**outcome.stats, "tried": len(tried)})
-    return outcome, guess
+            self.refused.append(error)
+            return None
+        self.tried.append((outcome, guess))
+        return outcome
 
+    def goes_on(self, guess: Guess) -> bool:
+        """Try a start that is no rival; whether what comes of it says little of those after it."""
+        outcome = self.run(guess)
+        if outcome is None:
+            return True
+        return not outcome.converged and (bool(outcome.stats.get("wandered")) or guess.held)
 
-def _goes_on(outcome: Outcome, guess: Guess) -> bool:
-    """Whether a run that failed says little of those from other starts."""
-    return bool(outcome.stats.get("wandered")) or guess.held
+    def compare(self, rivals: list[Guess]) -> None:
+        """Try the rivals, but for those to whose way a run has led already, or that will be dearer for certain.
+
+        What they will cost is certain, and the best of them are found, where one of them has come to cost that.
+        """
+        for rival in rivals:
+            led = self._led(rival)
+            self.trusted |= led is not None and _as_told(led, rival)
+        for rival in rivals:
+            if self.reporter.stop:
+                break
+            least = min((cost_of(one) for one, _ in self.tried if one.converged), default=np.inf)
+            if self._led(rival) is None and not (self.trusted and rival.about >= least):
+                outcome = self.run(rival)
+                self.trusted |= outcome is not None and outcome.converged and _as_told(outcome, rival)
+
+    def _led(self, rival: Guess) -> Outcome | None:
+        """A run that has come about to where a rival begins."""
+        begins = rival.trajectory.x
+        for outcome, _ in self.tried:
+            ends = outcome.extremal.trajectory.x
+            alike = outcome.converged and ends.shape == begins.shape
+            if alike and (np.abs(ends - begins) <= APART * np.ptp(ends, axis=0)).all():
+                return outcome
+        return None
+
+    def best(self) -> tuple[Outcome, Guess]:
+        """The cheapest outcome with the counts of all; where none converged that of the last start that is no rival."""
+        if not self.tried:
+            raise self.refused[0]
+        converged = [one for one in self.tried if one[0].converged]
+        if any(guess.rival for _, guess in self.tried) and converged:
+            outcome, guess = min(converged, key=lambda one: cost_of(one[0]))
+            return _with_all(outcome, [one for one, _ in self.tried]), guess
+        tried = [one for one in self.tried if not one[1].rival] or self.tried
+        outcome, guess = tried[-1]
+        if not outcome.converged and tried[0][1].held and not tried[0][0].stats.get("wandered"):
+            outcome, guess = tried[0]
+        elif not outcome.converged and outcome.stats.get("wandered") and not self.reporter.stop:
+            guess = tried[0][1]
+            outcome = self.prepared.solve(self.values, guess, self.reporter)
+        if len(self.tried) > 1:
+            outcome = replace(outcome, stats={**outcome.stats, "tried": len(self.tried)})
+        return outcome, guess
 
 
 def _with_all(best: Outcome, outcomes: list[Outcome]) -> Outcome:

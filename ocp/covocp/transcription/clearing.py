@@ -16,6 +16,8 @@ from covocp.transcription.steering import Run
 FINAL, LIMITS = 1e5, 300.0
 # Linearisations, changes of what binds within one, shares of a step, the gain below which no other is worth while.
 STEPS, CHANGES, LENGTHS, LITTLE = 10, 20, (1.0, 0.5, 0.2, 0.05), 3e-3
+# Share by which a condition gives way beside what holds it, so that conditions that say the same have a solution.
+SOFT = 1e-12
 # A push is done where this share of it is left at most.
 PUSHED = 0.1
 
@@ -167,28 +169,44 @@ def _change(along: Course, states: Array, rows: _Rows, task: Clearing) -> Array:
     lower, upper = (np.broadcast_to(b, along.u.shape).ravel() for b in run.statement.control_bounds)
     unit = np.where(np.isfinite(upper - lower) & (upper > lower), upper - lower, 1.0)
     fixed = list(task.fixed)
-    finals = states[-1][fixed] / run.divisors[fixed][:, None]
+    finals, misses = states[-1][fixed] / run.divisors[fixed][:, None], _misses(along, task)
     weights = run.weights / task.energy
-    H = np.diag(weights) + FINAL * finals.T @ finals
-    g = weights * v + FINAL * finals.T @ _misses(along, task)
     u, change, best, least = along.u.ravel(), np.zeros(v.size), np.zeros(v.size), np.inf
     for k in range(CHANGES):
-        over, value = np.maximum(rows.values + rows.slopes @ change, 0.0), 0.5 * change @ H @ change + g @ change
+        over, missed = np.maximum(rows.values + rows.slopes @ change, 0.0), misses + finals @ change
         outside = np.maximum(np.maximum(u + change - upper, lower - u - change) / unit, 0.0)
-        value += 0.5 * LIMITS * float(over @ over + outside @ outside)
+        value = weights @ (v + change) ** 2 + FINAL * missed @ missed + LIMITS * float(over @ over + outside @ outside)
         if value < least:
             best, least = change, value
         elif k > CHANGES // 2:
             break
-        A, c = rows.slopes[over > 0], rows.values[over > 0]
-        nearest = np.where(u + change > upper, upper - u, lower - u)
+        nearest = np.where(outside > 0, np.where(u + change > upper, upper - u, lower - u), 0.0)
         held = np.where(outside > 0, LIMITS / unit**2, 0.0)
-        right = -g - LIMITS * A.T @ c + held * np.where(outside > 0, nearest, 0.0)
-        following = np.linalg.solve(H + LIMITS * A.T @ A + np.diag(held), right)
+        following = _least_squares(
+            weights + held,
+            held * nearest - weights * v,
+            np.vstack([finals, rows.slopes[over > 0]]),
+            np.append(misses, rows.values[over > 0]),
+            np.append(np.full(misses.size, FINAL), np.full(np.count_nonzero(over > 0), LIMITS)),
+        )
         if np.array_equal(following, change):
             break
         change = following
     return best
+
+
+def _least_squares(own: Array, towards: Array, slopes: Array, values: Array, prices: Array) -> Array:
+    """The z with the least z @ (own * z) / 2 - towards @ z + prices @ (values + slopes @ z)**2 / 2.
+
+    By the rows, which are fewer than the unknowns, each in its own size: rows that say the same of what hardly moves
+    leave the sum singular but for the last digits, so that each is held a little less than exactly.
+    """
+    plain, answers = towards / own, slopes / own
+    gram = slopes @ answers.T + np.diag(1.0 / prices)
+    sizes = np.sqrt(np.diag(gram))
+    gram = gram / sizes / sizes[:, None] + SOFT * np.eye(sizes.size)
+    forces = np.linalg.solve(gram, (values + slopes @ plain) / sizes) / sizes
+    return np.asarray(plain - answers.T @ forces)
 
 
 def in_sizes(task: Clearing, sizes: Array, unit: float) -> Clearing:

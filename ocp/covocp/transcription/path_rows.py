@@ -156,14 +156,20 @@ def bulges(along: Course, row: int) -> bool:
 
     Nor known to be where it has no curvature, as the walls of a box.
     """
-    st, node = along.run.statement, int(np.argmax(along.excess[:, row]))
+    second = inward(along, row, int(np.argmax(along.excess[:, row])))
+    if second is None:
+        return True
+    values = np.linalg.eigvalsh(second)
+    return bool(values.min() < -ROUNDING * np.abs(values).max() or not values.any())
+
+
+def inward(along: Course, row: int, node: int) -> Array | None:
+    """Second slopes of what a condition is beyond its limit at a node, by the states; None where they have no value."""
+    st = along.run.statement
     at = along.points(np.array([node]), along.x[[node]])
     second = np.asarray(_row_curvatures(st)(*at).full())[row * st.nx : (row + 1) * st.nx]
-    if not np.isfinite(second).all():
-        return True
     sign = 1.0 if along.values[node, row] > along.upper[row] else -1.0
-    values = np.linalg.eigvalsh(0.5 * sign * (second + second.T))
-    return bool(values.min() < -ROUNDING * np.abs(values).max() or not values.any())
+    return 0.5 * sign * (second + second.T) if np.isfinite(second).all() else None
 
 
 @lru_cache(maxsize=KEPT)

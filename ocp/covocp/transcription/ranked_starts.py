@@ -47,13 +47,15 @@ SHARES, KEPT_BEND = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), 1 / 16
 def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
     """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
 
+    Before them come the ways round what they run through, the cheapest first: rivals of what comes of the others.
+
     Raises:
         ProblemError: where a rate is NaN or inf at the start (says which).
     """
     own = own_start(statement, mesh, parameters)
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
-        yield from _ways_round(statement, mesh, parameters, own, []) if free else []
+        yield from _ways(statement, mesh, parameters, own, []) if free else []
         yield own
         if own.held:
             yield own_start(statement, mesh, parameters, hold=False)
@@ -61,7 +63,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Firs
             yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
         return
     found = list(_others(statement, mesh, parameters, own.trajectory))
-    yield from _ways_round(statement, mesh, parameters, own, [first.trajectory for first in found])
+    yield from _ways(statement, mesh, parameters, own, [first.trajectory for first in found])
     yield from found or [own]
 
 
@@ -88,13 +90,21 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
         yield First(trajectory=completed(statement, mesh, parameters, u), plain=False)
 
 
+def _ways(statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory]) -> list[First]:
+    """See `_ways_round`; none where a number of the search has no value: the other starts are as good without it."""
+    try:
+        return list(_ways_round(statement, mesh, parameters, own, others))
+    except (np.linalg.LinAlgError, RuntimeError):  # what CasADi raises is a RuntimeError
+        return []
+
+
 def _ways_round(
     statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory]
 ) -> Iterator[First]:
     """Starts on the cheapest ways round what the problem's starts run through; none where they run through nothing.
 
-    Where nothing lies on the bent run and on the unbent one, but between them, both count. Starts that follow a guess,
-    or that a feedback holds, stay as they are.
+    Where nothing lies on the bent run and on the unbent one, but between them, the unbent one is a way as well. Starts
+    that follow a guess, or that a feedback holds, stay as they are.
     """
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
     if not plain or own.held or own.unbent is None or not curved_rows(statement):
@@ -109,17 +119,16 @@ def _ways_round(
         u, met = _beside(run, own.unbent, bend, own.trajectory.e)
         if met:
             yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
-            yield replace(own, rival=True)
         return
     roots = tried[:-1] if any(through[:-1]) else tried
     coarse = coarse_mesh(statement, mesh, tuple(parameters), DETOURS)
     least = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     rough = base_run(statement, coarse, parameters, start, least)
-    for u in detours(rough, *targets(rough), least, [run.clip(resampled(u, mesh, coarse)) for u in roots]):
+    for u, about in detours(rough, *targets(rough), least, [run.clip(resampled(u, mesh, coarse)) for u in roots]):
         alone = np.abs(u - least).max(axis=0) <= np.finfo(float).eps * np.abs(least).max(axis=0)
         u = run.clip(resampled(u, coarse, mesh))
         u = _beside(run, u, np.where(alone, bend, 0.0), own.trajectory.e)[0] if alone.any() else u
-        yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
+        yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True, about=about)
 
 
 def _beside(run: Run, u: Array, bend: Array, e: Array) -> tuple[Array, bool]:

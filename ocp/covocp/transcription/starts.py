@@ -64,7 +64,7 @@ class First:
     """A start, whether no others are worth looking at, whether a feedback holds it, whether it is one of several ways.
 
     unbent: the controls of the problem's own start before they were bent, where they were; rival: whether what is found
-    from it is to be compared with what is found from the others.
+    from it is to be compared with what is found from the others; about: what that will cost, NaN where nothing tells.
     """
 
     trajectory: Trajectory
@@ -72,6 +72,7 @@ class First:
     held: bool = False
     unbent: Array | None = None
     rival: bool = False
+    about: float = np.nan
 
     __repr__ = short_repr
 
