@@ -34,6 +34,7 @@ from covocp.solvers.reached import (
     similar,
     vanished,
 )
+from covocp.solvers.rounds import HELPED, best_of, helped, left
 from covocp.solvers.statuses import Status, status_of
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.separable import FOR_OWN, slopes
@@ -48,10 +49,6 @@ GIVEN_ROUNDS = 3
 # A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
 # of what is too much, between these.
 ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
-# Residuals that are larger by less than this factor are those of the same point.
-UNMOVED = 1.0 + 1e-9
-# A point that has converged is left for the next one as long as that has no more than this share of its residuals.
-HELPED = 0.5
 # Iterations of such a run, if none before took more; of one that learns its Hessian.
 FEW_MORE, FEW_MORE_LEARNT = 50, 300
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
@@ -151,8 +148,8 @@ class Runs:
             "hessian": "limited-memory" if self._limited else "exact",
         }
         unsettled = last.converged and not last.settled and last.residuals is not None
-        left = last.residuals.left if unsettled and last.residuals is not None else {}
-        counts |= dict.fromkeys(MUCH_LEFT, 0.0) | left  # always, so that none of an earlier run stays
+        remains = last.residuals.left if unsettled and last.residuals is not None else {}
+        counts |= dict.fromkeys(MUCH_LEFT, 0.0) | remains  # always, so that none of an earlier run stays
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
@@ -166,8 +163,8 @@ class Runs:
         begun: tuple[Any, ...] = ()
         idle, made, kept = 0, self._made(), None
         while not done[-1].settled and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
-            best = _best(done)
-            if best.converged and not _helped(done):
+            best = best_of(done)
+            if best.converged and not helped(done):
                 break
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
@@ -184,13 +181,13 @@ class Runs:
             point = self._run(own, self._solver(start.lam_x is not None), start, parameters, progress)
             found = self._judged(own, point, parameters, again=True)
             # magnitudes that vanish with the cost leave nothing to compare it with, but the point before
-            better = best.converged and _left(found) <= HELPED * _left(best)
+            better = best.converged and left(found) <= HELPED * left(best)
             done.append(replace(found, converged=found.converged or better))
             idle += point.iterations == 0
         kept = self._made() if kept is None else kept  # what has converged in a program is solved again in that
         self.__dict__.update(made if vanished(nlp, kept["_nlp"]) else kept)
         if not done[-1].settled:
-            done.append(done.pop(done.index(_best(done))))
+            done.append(done.pop(done.index(best_of(done))))
         return done
 
     def _made(self) -> dict[str, Any]:
@@ -483,34 +480,6 @@ def _within(nlp: Program, point: Point, parameters: Arrays) -> Point:
     bounds = nlp.bounds(parameters)
     w = np.clip(point.w, bounds["lbx"], bounds["ubx"])
     return replace(point, w=w, where=nlp.unpack(w, parameters))
-
-
-def _left(entry: Round) -> float:
-    """The largest change of the cost that a point leaves, in the unit of the cost; inf where that is not known."""
-    found = entry.residuals
-    return np.inf if found is None or found.violation > VIOLATION else found.worst * found.size
-
-
-def _helped(rounds: list[Round]) -> bool:
-    """Whether the last run left less than the ones before, or did not move at all, so that more is to be asked."""
-    if len(rounds) == 1:
-        return True
-    if rounds[-1].point.iterations == 0:
-        return rounds[-2].point.iterations > 0
-    return _left(rounds[-1]) <= HELPED * _left(_best(rounds[:-1]))
-
-
-def _best(rounds: list[Round]) -> Round:
-    """The round with the least residuals in the smallest cost without violations; the last where it did not move.
-
-    One that converged before all others.
-    """
-    rounds = [entry for entry in rounds if entry.converged] or rounds
-    judged = [entry.residuals for entry in rounds]
-    size = min((found.size for found in judged if found and found.violation <= VIOLATION), default=np.inf)
-    worst = [np.inf if found is None else found.beside(size) for found in judged]
-    least = int(np.argmin(worst))
-    return rounds[-1] if worst[-1] <= UNMOVED * worst[least] else rounds[least]
 
 
 def extremals(last: Round, parameters: Arrays) -> tuple[Extremal, ...]:

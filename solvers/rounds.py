@@ -1,0 +1,41 @@
+"""Runs one after the other from where the last one ended: which helped, which is the best."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from covocp.base.residuals import VIOLATION
+from covocp.solvers.reached import Round
+
+# Residuals that are larger by less than this factor are those of the same point.
+UNMOVED = 1.0 + 1e-9
+# A point that has converged is left for the next one as long as that has no more than this share of its residuals.
+HELPED = 0.5
+
+
+def left(entry: Round) -> float:
+    """The largest change of the cost that a point leaves, in the unit of the cost; inf where that is not known."""
+    found = entry.residuals
+    return np.inf if found is None or found.violation > VIOLATION else found.worst * found.size
+
+
+def helped(rounds: list[Round]) -> bool:
+    """Whether the last run left less than the ones before, or did not move at all, so that more is to be asked."""
+    if len(rounds) == 1:
+        return True
+    if rounds[-1].point.iterations == 0:
+        return rounds[-2].point.iterations > 0
+    return left(rounds[-1]) <= HELPED * left(best_of(rounds[:-1]))
+
+
+def best_of(rounds: list[Round]) -> Round:
+    """The round with the least residuals in the smallest cost without violations; the last where it did not move.
+
+    One that converged before all others.
+    """
+    rounds = [entry for entry in rounds if entry.converged] or rounds
+    judged = [entry.residuals for entry in rounds]
+    size = min((found.size for found in judged if found and found.violation <= VIOLATION), default=np.inf)
+    worst = [np.inf if found is None else found.beside(size) for found in judged]
+    least = int(np.argmin(worst))
+    return rounds[-1] if worst[-1] <= UNMOVED * worst[least] else rounds[least]
