@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.residuals import MUCH_LEFT, VIOLATION, Residuals
+from covocp.base.residuals import LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
@@ -126,6 +126,8 @@ class Runs:
         warm = dual and all(guess.warm for guess in guesses)
         units = tuple(guess.scales for guess in guesses if guess.scales is not None)
         known_units = units if len(units) == len(guesses) else None
+        if any(guess.rival for guess in guesses):
+            self._nlp = None  # magnitudes of the way through an obstacle are none of those round it
         nlp, solver = self._build(known_units, trajectories, parameters, warm, progress.shown)
         built = time.perf_counter()
         start = Start(w=nlp.pack(trajectories))
@@ -148,8 +150,7 @@ class Runs:
             "hessian": "limited-memory" if self._limited else "exact",
         }
         unsettled = last.converged and not last.settled and last.residuals is not None
-        remains = last.residuals.left if unsettled and last.residuals is not None else {}
-        counts |= dict.fromkeys(MUCH_LEFT, 0.0) | remains  # always, so that none of an earlier run stays
+        counts[LEFT] = last.residuals.left if unsettled and last.residuals is not None else 0.0
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
@@ -171,7 +172,10 @@ class Runs:
             if best.converged and kept is None:
                 kept = self._made()
             given = len(done) < GIVEN_ROUNDS
-            own, start = self._rescaled(best, nlp, parameters, dual=done[-1] is best, given=given)
+            if best.converged and len(done) == 1:  # first in the program that there is: another one takes its time
+                own, start = nlp, Start(w=best.point.w, lam_x=best.point.lam_x, lam_g=best.point.lam_g)
+            else:
+                own, start = self._rescaled(best, nlp, parameters, dual=done[-1] is best, given=given)
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
             if self._open and ((done[-1] is best and own is best.nlp) or before == begun):

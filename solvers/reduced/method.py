@@ -147,10 +147,10 @@ class ReducedRuns(Runs):
         return None if engine is None else engine.functions
 
     def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
-        """As of Ipopt, but for a cost beside whose penalties no step is seen any more: another method may see some."""
+        """As of Ipopt, but a cost beside whose penalties no step is seen any more has not converged."""
         found = super()._judged(nlp, point, parameters, again)
         lost = found.converged and found.residuals is not None and not found.settled and found.residuals.too_steep
-        return replace(found, converged=False) if lost else found
+        return replace(found, converged=False, residuals=None) if lost else found
 
     def _tighten(self, found: Residuals) -> None:
         """All by the tolerance: nothing here is compared with one. What led to no step at all is not asked again."""

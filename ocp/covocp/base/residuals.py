@@ -43,10 +43,8 @@ STEEP = 1e-3
 # Slope, resolved and as large beside the cost, from which on more than a small share of the cost may be had; costs that
 # are none, whose slopes are none either.
 TOO_STEEP, NOTHING = 0.1, 1e-24
-# What a solver could not make less, among the counts of a solution, and from which on it is told: of slopes the square
-# is what can be had.
-BOUNDS_LEFT, SLOPES_LEFT = "complementarity_left", "stationarity_left"
-MUCH_LEFT = {BOUNDS_LEFT: 1e-4, SLOPES_LEFT: 3e-2}
+# Complementarity that a solver could not make less and that is told, and what it is among the counts of a solution.
+LEFT, MUCH_LEFT = "complementarity_left", 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +111,9 @@ class Residuals:
         return self.varied > 0.0 and self.size <= NO_SIZE * self.varied
 
     @property
-    def left(self) -> dict[str, float]:
-        """What a point that does not settle leaves, relative to the cost, as it is told: by bounds, by slopes."""
-        return {BOUNDS_LEFT: self.complementarity, SLOPES_LEFT: self._resolved[0]}
+    def left(self) -> float:
+        """The complementarity of a point that does not settle; 0 where that is roundoff of what changes the cost."""
+        return self.complementarity if self.size > ROUNDED * self.varied else 0.0
 
     @property
     def too_steep(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
-from covocp.base.residuals import BOUNDS_LEFT, MUCH_LEFT, SLOPES_LEFT
+from covocp.base.residuals import LEFT, MUCH_LEFT
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
@@ -77,13 +77,13 @@ def mention_doubts(solution: Solution) -> None:
 
 
 def mention_gap(stats: Mapping[str, Any]) -> None:
-    """Warn of a cost that may be above the least one, by what bounds and slopes leave of it."""
-    left = {name: float(stats.get(name, 0.0)) for name in MUCH_LEFT}
-    if any(left[name] > much for name, much in MUCH_LEFT.items()):
+    """Warn of a cost that may be above the least one by what bounds leave of it."""
+    left = float(stats.get(LEFT, 0.0))
+    if left > MUCH_LEFT:
         warn_user(
-            "The cost may be above the least one: where multipliers push at bounds that are not reached "
-            f"{left[BOUNDS_LEFT]:.1e} of it is left, by its slopes {left[SLOPES_LEFT]:.1e}. Start again from this "
-            "solution (guess=), or make the largest weights of the cost smaller, or conditions of them."
+            f"The cost may be above the least one: {left:.1e} of it is left where multipliers push at bounds that are "
+            "not reached. Start again from this solution (guess=), or make the largest weights of the cost smaller, or "
+            "conditions of them."
         )
 
 
