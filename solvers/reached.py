@@ -11,7 +11,7 @@ import numpy as np
 
 from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
-from covocp.base.residuals import LIMIT, NO_SIZE, Residuals, complementary
+from covocp.base.residuals import LIMIT, NO_SIZE, ROUNDED, VIOLATION, Residuals, complementary
 from covocp.base.short_repr import short_repr
 from covocp.solvers.at_point import AtPoint, Weighed
 from covocp.transcription.nlp import NLP, Scales
@@ -249,6 +249,9 @@ def residuals(
         each = zip(nlp.each(trajectories, parameters), scales, strict=True)
         own = np.sum([_change_at_nodes(*entry, units) for entry, units in each])
         varied = min(moved, float(own))
+    if size <= NO_SIZE * varied:  # what is left of magnitudes at rest is roundoff of those of the program
+        at_rest = np.concatenate([excess / np.maximum(1.0, row), apart]).max(initial=0.0)
+        worst = min(worst, float(at_rest) * VIOLATION / ROUNDED)
     size = max(size, NO_SIZE * varied, float(np.finfo(float).tiny))
     changes = {"slope": slope / size, "complementarity": rest / size, "infeasibility": missed / size}
     return Residuals(**changes, violation=worst, size=size, varied=varied)

@@ -54,6 +54,8 @@ FEW_MORE, FEW_MORE_LEARNT = 50, 300
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
+# Distance from the optimum in magnitudes, of slopes, below which a run starts at rest: nothing smaller is a unit.
+AT_REST = 1e-9
 
 # Solvers of a program: from a start, from one with multipliers, and where a run crawled: with a Hessian that begins
 # with this, so that a step along a slope without curvature goes to the bounds (17 of 36 experiments with bounded inputs
@@ -466,7 +468,9 @@ class Runs:
         step = PROBE / size
         _, second = of.cost(w0 - step * first, parameters)
         curvature = abs(float((first - second) @ first)) / (step * size**2)
-        return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+        if not np.isfinite(curvature):
+            return largest
+        return float(np.clip(curvature, SMALLEST_CURVATURE * largest, max(largest, AT_REST * curvature)))
 
 
 def _numbers(value: Any) -> Array:

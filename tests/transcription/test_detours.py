@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import solve
+from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.transcription import ranked_starts
@@ -290,3 +291,39 @@ def test_nothing_is_looked_for_where_the_start_runs_free(monkeypatch):
     problem, x, _ = walk()
     problem.subject_to(apart(x, 5.0, 30.0), lower=RADIUS**2)
     assert solve(problem, intervals=30).converged
+
+
+# --- beside covariances -----------------------------------------------------------------------------------------------
+
+
+def drifting(known: bool) -> co.Problem:
+    """An unstable point in the plane with a tree beside its way, and what is known of it at the end in the cost."""
+    problem = co.Problem(duration=6.0, name="drifting")
+    given = ({"variance": 0.05}, {"variance": 0.01}) if known else ({}, {})
+    x = problem.state("x", 2, initial=[0.0, 0.0], final=[8.0, 0.0], **given[0])
+    v = problem.state("v", 2, initial=0.0, final=0.0, **given[1])
+    u = problem.control("u", 2)
+    problem.dynamics(x, v)
+    problem.dynamics(v, u + 0.2 * v, noise=0.01 if known else 0.0)
+    problem.subject_to(ca.sqrt(apart(x, 4.0, 0.4) + 1e-6), lower=1.0, name="tree")
+    end = 0.0
+    if known:
+        problem.measurement("position", x, noise=0.02)
+        E = problem.estimation_covariance()
+        end = 3.0 * ca.trace(E[x, x])
+    problem.minimize(running=0.5 * ca.sumsqr(u), terminal=end)
+    return problem
+
+
+@pytest.mark.filterwarnings("ignore:Between the points where it is imposed")
+def test_a_rival_has_magnitudes_of_its_own_beside_covariances():
+    """The controls do not move what is known: the cost is that without it, and a sum. In those of the way through the
+    tree no run found its way."""
+
+    def rate(_, e):
+        E, F = e.reshape(2, 2), np.array([[0.0, 1.0], [0.0, 0.2]])
+        return (F @ E + E @ F.T + np.diag([0.0, 0.01]) - np.outer(E[:, 0], E[0]) / 0.02).ravel()
+
+    end = solve_ivp(rate, (0.0, 6.0), np.diag([0.05, 0.01]).ravel(), rtol=1e-10, atol=1e-12).y[0, -1]
+    alone = solve(drifting(known=False), intervals=25).cost
+    assert solve(drifting(known=True), intervals=25).cost == pytest.approx(alone + 3.0 * 2.0 * end, rel=1e-4)
