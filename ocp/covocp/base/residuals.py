@@ -97,18 +97,10 @@ class Residuals:
         return replace(self, slope=slope, complementarity=apart, infeasibility=missed, size=size, varied=0.0)
 
     def settle(self, limit: float) -> bool:
-        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is.
-
-        Beside a cost that vanishes nothing more can be had that counts.
-        """
+        """Whether no further run is worth it: all small relative to the cost, slopes so that their square is."""
         slope, *others = self._resolved
         gentle = slope <= max(STEEP, limit) and all(part <= limit for part in others)
-        return self.hold(limit) or ((gentle or self.vanishes) and self.hold_of_changes(limit))
-
-    @property
-    def vanishes(self) -> bool:
-        """Whether the cost is none beside what the variables change of it."""
-        return self.varied > 0.0 and self.size <= NO_SIZE * self.varied
+        return self.hold(limit) or (gentle and self.hold_of_changes(limit))
 
     @property
     def left(self) -> float:
