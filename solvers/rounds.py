@@ -11,6 +11,8 @@ from covocp.solvers.reached import Round
 UNMOVED = 1.0 + 1e-9
 # A point that has converged is left for the next one as long as that has no more than this share of its residuals.
 HELPED = 0.5
+# Share of the cost by which one of several points that have converged is dearer than another.
+DEARER = 1e-6
 
 
 def left(entry: Round) -> float:
@@ -31,11 +33,21 @@ def helped(rounds: list[Round]) -> bool:
 def best_of(rounds: list[Round]) -> Round:
     """The round with the least residuals in the smallest cost without violations; the last where it did not move.
 
-    One that converged before all others.
+    One that converged before all others, and of several the cheapest: beside large penalties both may leave much.
     """
-    rounds = [entry for entry in rounds if entry.converged] or rounds
+    converged = [entry for entry in rounds if entry.converged]
+    if converged:
+        cheapest = min(cost(entry) for entry in converged)
+        rounds = [entry for entry in converged if cost(entry) <= cheapest + DEARER * abs(cheapest)]
     judged = [entry.residuals for entry in rounds]
     size = min((found.size for found in judged if found and found.violation <= VIOLATION), default=np.inf)
     worst = [np.inf if found is None else found.beside(size) for found in judged]
     least = int(np.argmin(worst))
     return rounds[-1] if worst[-1] <= UNMOVED * worst[least] else rounds[least]
+
+
+def cost(entry: Round) -> float:
+    """Of the point where a run ended, with what its violations may have saved."""
+    found = entry.residuals
+    saved = 0.0 if found is None else found.infeasibility * found.size
+    return float(sum(part["running"] + part["terminal"] for part in entry.where[1]["parts"])) + saved

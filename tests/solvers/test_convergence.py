@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 import pytest
 from random_problems import draw
 
 import covocp as co
+from covocp.base.residuals import Residuals
 from covocp.extremal.optimality import complementarity
 from covocp.models import unknown_lag
 from covocp.solvers import runs
 from covocp.solvers.gradient.memory import damped, learnt
+from covocp.solvers.reached import Round
+from covocp.solvers.rounds import best_of
 
 LAG_MINIMA = (7.08523844, 7.71199)  # of the lag with weight 10 on 50 intervals, from starts of the right size
 
@@ -310,3 +315,19 @@ def test_a_plant_at_rest_is_solved_again_and_leaves_no_scales_behind() -> None:
         assert guess.cost < 1e-15
     alone = co.Solver(ocp, intervals=20).solve({"p": 1.0}, progress=False)
     assert solver.solve({"p": 1.0}, guess=guess, progress=False).cost == pytest.approx(alone.cost, rel=1e-6)
+
+
+def ended(running: float, slope: float, varied: float, *, converged: bool = True) -> Round:
+    """Where a run might have ended: its cost, what its slopes leave of that, what variables change of it."""
+    left = Residuals(slope=slope, complementarity=0.0, infeasibility=0.0, violation=0.0, size=running, varied=varied)
+    where: Any = ((), {"parts": [{"running": running, "terminal": 0.0}]})
+    rest: Any = {"nlp": None, "point": None}
+    return Round(**rest, where=where, residuals=left, converged=converged, settled=False)
+
+
+def test_of_points_that_have_converged_the_cheapest_counts() -> None:
+    """Beside a weight of 7e11 both leave slopes: what came second, with smaller ones, cost 1115 for 37.9."""
+    cheap, dear, alike = ended(37.9, 3e4, 3.3e12), ended(1115.0, 47.0, 6e14), ended(37.9 + 1e-7, 2e4, 3.3e12)
+    assert best_of([cheap, dear]) is cheap
+    assert best_of([cheap, alike, dear]) is alike
+    assert best_of([cheap, dear, ended(1.0, 0.1, 1e12, converged=False)]) is cheap

@@ -81,7 +81,6 @@ class _Runs:
     reporter: Progress
     tried: list[tuple[Outcome, Guess]] = field(default_factory=list)
     refused: list[OutsideDomainError] = field(default_factory=list)
-
     trusted: bool = False
 
     __repr__ = short_repr
