@@ -158,6 +158,8 @@ def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature 
     theta = 1.0 if sy >= KEPT_SHARE * sBs else (1.0 - KEPT_SHARE) * sBs / (sBs - sy)
     r = theta * difference + (1.0 - theta) * Bs
     sr = float(change @ r)
+    if not sr > 0.0:  # too small to be told from nothing
+        return curvature
     Hr = H @ r
     scaled = change / sr
     B = B + np.outer(r, r / sr) - np.outer(Bs, Bs / sBs)

@@ -198,3 +198,37 @@ def test_a_problem_without_the_library_has_the_same_solution(monkeypatch, seed, 
         own, other = (getattr(solution.costates, name) for solution in (fast, plain))
         # where they are zero but for the tolerance of the run, 1e-7, they agree in nothing
         assert np.abs(own - other).max() <= max(1e-5 * np.abs(other).max(), 1e-8 * abs(plain.cost))
+
+
+def plain_dynamics(limit: str) -> co.Problem:
+    """x' = u without drift or noise, b x read once: E_bb = 1/(1 + x(1.5)^2/0.1) must fall to 0.05."""
+    ocp = co.Problem(2.0)
+    x = ocp.state("x", initial=0.0)
+    b = ocp.unknown("b", mean=1.0, variance=1.0)
+    u = ocp.control("u", guess=0.5)
+    ocp.dynamics(x, u)
+    ocp.measurement("m", b * x, noise=0.1, at=[1.5])
+    E = ocp.estimation_covariance()[b, b]
+    limits = {"variance": (E, 0.05), "logarithm": (ca.log(E), np.log(0.05)), "inverse": (-1 / E, -20.0)}
+    ocp.subject_to(limits[limit][0], at="final", upper=limits[limit][1])
+    ocp.minimize(running=u**2)
+    return ocp
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+@pytest.mark.parametrize("limit", ["variance", "logarithm", "inverse"])
+def test_a_limit_on_what_only_readings_change_is_met(limit, method):
+    """Where nothing moves a covariance but readings the entries of h H are structurally zero: slopes were lost there."""
+    solution = co.solve(plain_dynamics(limit), method, intervals=40, progress=False)
+    assert solution.cost == pytest.approx(1.9 / 1.5, rel=1e-6)  # x(1.5)^2 = 1.9 by a constant u, nothing after it
+
+
+def test_what_only_readings_change_depends_on_them():
+    """The first steps move nothing: their entries are structurally zero, those after the first reading are not."""
+    n, rows = 2, 1
+    first, told = ca.MX(half_length(n), 1), ca.MX.sym("told", rows * n + half_length(rows))
+    still = ca.MX(2 * n, 2 * n * 2)
+    dependence = depends(first, (still, still), n, told=Told(steps=(1,), rows=rows, columns=told))
+    pattern = np.asarray(ca.DM(ca.jacobian_sparsity(dependence, told), 1).full()) != 0
+    assert not pattern[: half_length(n)].any()
+    assert pattern[half_length(n) :].all()

@@ -86,3 +86,9 @@ def test_what_numpy_cannot_solve_is_a_run_that_failed(monkeypatch):
     found = co.solve(ocp, "auto", intervals=40, progress=False)
     assert found.method == "ipopt"
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+
+
+def test_a_step_too_small_to_be_told_from_nothing_teaches_nothing():
+    """The product of step and difference underflows: there is no curvature to be read from it."""
+    curvature, step = Curvature.of(np.eye(2)), np.array([3e-162, 0.0])
+    assert learnt(curvature, step, -step) is curvature

@@ -127,7 +127,8 @@ def depends(
         each = ca.sum1(ca.reshape(each, every, each.shape[1] // every))
     if kicks is not None:
         each = each + ca.sum1(kicks)
-    return ca.repmat(ca.sum1(first) + ca.cumsum(each, 1), half_length(size), 1)
+    # without `densify` CasADi's sums along a row end where its first entry is structurally zero
+    return ca.repmat(ca.sum1(first) + ca.cumsum(ca.densify(each), 1), half_length(size), 1)
 
 
 def _pattern(points: Sequence[Expr], size: int) -> tuple[list[int], list[int]]:

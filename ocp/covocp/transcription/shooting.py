@@ -299,10 +299,10 @@ def _gathered(
         before = ca.vertcat(starts, inside[: after.shape[0] * (m - 1), :])
         before = ca.reshape(before, after.shape[0], n * m)
     step = gathering_step(statement, mesh.step, mesh.linear_solver).map(n * m)
-    later: Any = ca.cumsum(step(before, after, *columns), 1)
+    later: Any = ca.cumsum(ca.densify(step(before, after, *columns)), 1)
     begin: Any = ca.repmat(first, 1, n)
     if kicks is not None:
-        passed: Any = ca.cumsum(kicks, 1)
+        passed: Any = ca.cumsum(ca.densify(kicks), 1)
         begin = begin + passed[:, :n]
         first = first + kicks[:, 0]
     spread: Any = ca.kron(begin, ca.DM.ones(1, m))
