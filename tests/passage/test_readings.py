@@ -218,7 +218,7 @@ def plain_dynamics(limit: str) -> co.Problem:
 @pytest.mark.parametrize("method", ["ipopt", "reduced"])
 @pytest.mark.parametrize("limit", ["variance", "logarithm", "inverse"])
 def test_a_limit_on_what_only_readings_change_is_met(limit, method):
-    """Where nothing moves a covariance but readings the entries of h H are structurally zero: slopes were lost there."""
+    """Where readings alone move a covariance the entries of h H are structurally zero: slopes were lost there."""
     solution = co.solve(plain_dynamics(limit), method, intervals=40, progress=False)
     assert solution.cost == pytest.approx(1.9 / 1.5, rel=1e-6)  # x(1.5)^2 = 1.9 by a constant u, nothing after it
 
