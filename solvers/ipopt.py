@@ -34,6 +34,7 @@ from covocp.transcription.program import Arrays, Program, Trajectories, alone, j
 from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.sequences import Passage
 from covocp.transcription.stiffness import resolve_mesh
+from covocp.transcription.trajectory import Trajectory
 from covocp.transcription.transcribing import transcribe
 
 TOLERANCE = 1e-7
@@ -262,6 +263,10 @@ class ShootingSolver:
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
         return self._runs.outcome(parameters, guess, progress)
+
+    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
+        """What the controls of a trajectory cost; NaN where that is no number."""
+        return self._runs.cost((parameters,), (trajectory,))
 
 
 class ChainSolver:

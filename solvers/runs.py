@@ -128,7 +128,7 @@ class Runs:
         warm = dual and all(guess.warm for guess in guesses)
         units = tuple(guess.scales for guess in guesses if guess.scales is not None)
         known_units = units if len(units) == len(guesses) else None
-        if any(guess.rival for guess in guesses):
+        if any(guess.rival and not guess.alike for guess in guesses):
             self._nlp = None  # magnitudes of the way through an obstacle are none of those round it
         nlp, solver = self._build(known_units, trajectories, parameters, warm, progress.shown)
         built = time.perf_counter()
@@ -155,6 +155,13 @@ class Runs:
         counts[LEFT] = last.residuals.left if unsettled and last.residuals is not None else 0.0
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
+
+    def cost(self, parameters: Arrays, trajectories: Trajectories) -> float:
+        """What the variables of some trajectories cost, in the program that they would be solved in; NaN: no number."""
+        nlp, _ = self._build(None, trajectories, parameters, False, False)
+        with np.errstate(all="ignore"):
+            value = float(self._first_order().cost(nlp.pack(trajectories), parameters)[0])
+        return value if np.isfinite(value) else np.nan
 
     def _rounds(self, nlp: Program, first: Point, parameters: Arrays, progress: Progress) -> list[Round]:
         """The first run judged in the scale of the point it reached, and further ones from there until that holds.

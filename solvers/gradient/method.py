@@ -288,6 +288,13 @@ class GradientSolver:
             },
         )
 
+    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
+        """What the controls of a trajectory cost; NaN where that is no number."""
+        with np.errstate(all="ignore"):
+            guess = Guess(trajectory=trajectory)
+            value = float(self.space(parameters, guess).first(guess).run.cost)
+        return value if np.isfinite(value) else np.nan
+
     def space(self, parameters: Array, guess: Guess) -> Space:
         """The unknowns of the method for these parameters, with the compiled sweeps."""
         if self._sweeps is None:

@@ -141,6 +141,9 @@ class Prepared(Protocol):
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess."""
 
+    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
+        """What the controls of a trajectory cost; NaN where that is no number."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Guess:
@@ -156,6 +159,8 @@ class Guess:
         held: whether a feedback holds an unstable nominal along it, which need not be the way.
         rival: whether it is one of several ways round what may not be entered: the cheapest that comes of them counts.
         about: what a rival is thought to cost, NaN where nothing tells.
+        alike: whether a rival has the magnitudes of the problem's own start, whose program serves it.
+        sides: the start as it is to be compared with those that are bent to other sides, and these; none: one side.
     """
 
     trajectory: Trajectory
@@ -167,5 +172,7 @@ class Guess:
     held: bool = False
     rival: bool = False
     about: float = np.nan
+    alike: bool = False
+    sides: tuple[Trajectory, ...] = ()
 
     __repr__ = short_repr

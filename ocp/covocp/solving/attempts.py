@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
 
-from covocp.base.errors import Interrupted, OutsideDomainError, warn_user
+from covocp.base.errors import Interrupted, OutsideDomainError, ProblemError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -26,6 +26,9 @@ TRIED = 4
 APART = 0.05
 # A rival costs what it was thought to, up to this share.
 TOLD = 0.01
+# Starts that are bent to other sides: those that cost more than the cheapest by more than this share lead to no cheaper
+# minimum (of 300 random identifications none did), and those that cost the same up to this share are its mirror image.
+DEARER, SAME, MOST_SIDES = 0.25, 1e-9, 3
 
 
 def from_starts(
@@ -46,6 +49,11 @@ def from_starts(
     """
     runs = _Runs(prepared=prepared, values=values, reporter=reporter)
     rivals, others = _parted(guesses)
+    first = next(others, None)
+    if first is not None:
+        sided = _sides(prepared, values, first) if first.sides else [first]
+        turned = sided[0].trajectory is not first.trajectory
+        rivals, others = [*sided[1:], *rivals], chain(sided[:1], [first] if turned else [], others)
     for count in range(TRIED):
         guess = next(others, None)
         more = guess is not None and runs.goes_on(guess)
@@ -54,6 +62,26 @@ def from_starts(
         if not more or reporter.stop or runs.trusted:
             break
     return runs.best()
+
+
+def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
+    """The start, and those bent to other sides, that are worth a run: the cheapest first, then its rivals."""
+    first, *mirrored = own.sides
+    alone = prepared.cost(values, own.trajectory)  # first: its magnitudes are those of the program
+    alone = alone if first is own.trajectory else prepared.cost(values, first)
+    if not np.isfinite(alone):
+        return [own]
+    costs = [(alone, replace(own, alike=True))]
+    costs += [(prepared.cost(values, t), Guess(trajectory=t, alike=True)) for t in mirrored]
+    least = min(cost for cost, _ in costs if np.isfinite(cost))
+    size = abs(least)
+    costs[0] = (alone - SAME * size, costs[0][1])  # before its mirror image
+    found: list[tuple[float, Guess]] = []
+    for cost, guess in sorted((entry for entry in costs if np.isfinite(entry[0])), key=lambda entry: entry[0]):
+        twin = any(abs(cost - other) <= 2.0 * SAME * size for other, _ in found)
+        if cost - least <= DEARER * size and not twin and len(found) < MOST_SIDES:
+            found.append((cost, replace(guess, rival=bool(found))))
+    return [guess for _, guess in found]
 
 
 def _as_told(outcome: Outcome, rival: Guess) -> bool:
@@ -162,24 +190,36 @@ def mention_left(error: OutsideDomainError) -> None:
     warn_user(f"The solution that was given is no guess for these values, so the own start was taken: {problem}")
 
 
-def best_of(prepared: Any, values: Any, guesses: Iterable[Any], count: int, reporter: Progress) -> Any:
+def best_of(
+    prepared: Any,
+    values: Any,
+    guesses: Iterable[Any],
+    count: int,
+    reporter: Progress,
+    own: Callable[[], tuple[AnyOutcome, Any]] | None = None,
+) -> Any:
     """The cheapest converged outcome of several starts, with the costs of all of them (NaN: did not converge).
+
+    `own`: how the problem is solved without random starts, which comes first.
 
     Of one problem, or of several phases: then parameters and guesses are tuples, one for each.
 
     A start outside the domain of the model counts as one that did not converge.
 
     Raises:
-        OutsideDomainError: all of them lie outside it (says what the first one lacks).
+        ProblemError: all of them lie outside it (says what the first one lacks).
     """
     best: Any = None
     stopped: tuple[int, Any] | None = None
-    refused: list[OutsideDomainError] = []
+    refused: list[ProblemError] = []
     costs: list[float] = []
-    for guess in guesses:
+    for guess in chain([] if own is None else [None], guesses):
         try:
-            outcome = prepared.solve(values, _tentative(guess), reporter)
-        except OutsideDomainError as error:
+            if guess is None and own is not None:
+                outcome, _ = own()
+            else:
+                outcome = prepared.solve(values, _tentative(guess), reporter)
+        except ProblemError as error:
             refused.append(error)
             costs.append(np.nan)
             continue
@@ -187,7 +227,7 @@ def best_of(prepared: Any, values: Any, guesses: Iterable[Any], count: int, repo
         costs.append(cost if outcome.converged else np.nan)
         if best is None or (outcome.converged, -cost) > (best.converged, -cost_of(best)):
             best = outcome
-        if stopped is None and outcome.stats.get("wandered"):
+        if stopped is None and guess is not None and outcome.stats.get("wandered"):
             stopped = len(costs) - 1, guess
         if reporter.stop:
             break

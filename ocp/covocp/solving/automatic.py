@@ -15,6 +15,7 @@ from covocp.extremal.links import ChainOutcome
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.trajectory import Trajectory
 
 IPOPT, REDUCED = "covocp.solvers.ipopt", "covocp.solvers.reduced"
 # Control values from which on the dense Hessian of the reduced method takes longer than its sweeps.
@@ -123,6 +124,10 @@ class Automatic:
                     return _named(outcome, "reduced", 0.0)
                 spent = float(outcome.stats.get("solve_seconds", 0.0))
         return _named(self._ipopt.solve(parameters, guess, progress), "ipopt", spent)
+
+    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
+        """What the controls of a trajectory cost; NaN where that is no number."""
+        return (self._reduced or self._ipopt).cost(parameters, trajectory)
 
 
 def _named(outcome: Outcome, method: str, spent: float) -> Outcome:

@@ -70,9 +70,17 @@ class WithoutRows:
             ),
         )
 
+    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
+        """What the controls of a trajectory cost; NaN where that is no number."""
+        return self._prepared.cost(parameters, self._taken(trajectory))
+
+    def _taken(self, trajectory: Trajectory) -> Trajectory:
+        """A trajectory without the rows."""
+        return replace(trajectory, e=self._rows.taken(trajectory.e))
+
     def _cut(self, guess: Guess) -> Guess:
         """A guess without the rows."""
-        trajectory: Trajectory = replace(guess.trajectory, e=self._rows.taken(guess.trajectory.e))
+        trajectory = self._taken(guess.trajectory)
         multipliers: Multipliers | None = guess.multipliers
         if multipliers is not None:
             multipliers = replace(

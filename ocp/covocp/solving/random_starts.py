@@ -18,7 +18,6 @@ from covocp.extremal.extremal import Guess
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import check_model, control_scale, controls_guess, is_plain, starts
 from covocp.transcription.mesh import Mesh, control_places
-from covocp.transcription.ranked_starts import ranked
 from covocp.transcription.starts import (
     WIDE,
     base_run,
@@ -45,26 +44,15 @@ STARTS, MOST_STARTS = 8, 10**6
 
 
 def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: int, seed: int) -> Iterator[Guess]:
-    """The problem's own start, then random ones.
+    """Random starts.
 
     Free initial values and durations are drawn one from each of `count` equally likely ranges, in random order: few
     starts then look everywhere.
     """
-    own: ProblemError | None = None
-    try:
-        first = next(ranked(statement, mesh, parameters))
-    except ProblemError as error:  # the others may lie within the domain of the model
-        own = error
-    else:
-        yield Guess(trajectory=first.trajectory)
-    made = 0
     for k in range(count):
         guess = drawn_guess(statement, mesh, parameters, count, seed, k)
         if guess is not None:
-            made += 1
             yield guess
-    if own is not None and not made:
-        raise own
 
 
 def drawn_guess(statement: Statement, mesh: Mesh, parameters: Array, count: int, seed: int, k: int) -> Guess | None:

@@ -239,8 +239,10 @@ class Solver:
         with evaluating(self.statement.name):
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 if isinstance(guess, str):
-                    guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
-                    outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter), None
+                    here = (self._solved, self._prepared.mesh, values)
+                    alone = partial(from_starts, self._prepared, values, make_guesses(*here, None), reporter)
+                    guesses = random_guesses(*here, starts, seed)
+                    outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter, alone), None
                     if assess:
                         outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:

@@ -61,7 +61,9 @@ def make_guesses(
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
         for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
-            yield Guess(trajectory=first.trajectory, held=first.held, rival=first.rival, about=first.about)
+            yield Guess(
+                trajectory=first.trajectory, held=first.held, rival=first.rival, about=first.about, sides=first.sides
+            )
     else:
         raise ProblemError(
             "The guess is of an unknown kind.",

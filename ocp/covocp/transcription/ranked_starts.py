@@ -18,6 +18,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.detours import detours
 from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.mirrored import other_sides
 from covocp.transcription.path_rows import bulges, course, curved_rows
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.starts import (
@@ -56,7 +57,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Firs
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
         yield from _ways(statement, mesh, parameters, own, []) if free else []
-        yield own
+        yield replace(own, sides=other_sides(statement, mesh, parameters, own)) if free else own
         if own.held:
             yield own_start(statement, mesh, parameters, hold=False)
         if free:

@@ -65,6 +65,7 @@ class First:
 
     unbent: the controls of the problem's own start before they were bent, where they were; rival: whether what is found
     from it is to be compared with what is found from the others; about: what that will cost, NaN where nothing tells.
+    sides: the start as it is compared with those that are bent to other sides, and these; of those that may learn more.
     """
 
     trajectory: Trajectory
@@ -73,6 +74,7 @@ class First:
     unbent: Array | None = None
     rival: bool = False
     about: float = np.nan
+    sides: tuple[Trajectory, ...] = ()
 
     __repr__ = short_repr
 

@@ -1,0 +1,71 @@
+"""Starts that excite to the other side: what is learnt of a system may depend on the side, and no solver changes it.
+
+Near a symmetric run, where little is learnt, controls of both signs learn more, and each sign leads to a minimum of its
+own. What else the cost asks for, an initial state or a correlation of the prior, makes one of them cheaper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.starts import First, base_run, completed, targets
+from covocp.transcription.steering import steer
+from covocp.transcription.trajectory import Trajectory
+
+# Controls of which all combinations of signs are made; of more than these each is turned alone, and all together.
+COMBINED = 3
+
+
+def other_sides(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> tuple[Trajectory, ...]:
+    """The problem's own start as it is to be compared with those that are bent to other sides, and these.
+
+    Returns:
+        None where what is learnt does not depend on the side, or the start is not one that was bent.
+    """
+    if own.unbent is None or own.held or not own.plain or not _learns(statement):
+        return ()
+    bend = own.trajectory.u - own.unbent
+    if not np.isfinite(own.trajectory.x).all() or not bend.any():
+        return ()
+    run = base_run(statement, mesh, parameters, own.trajectory.x[0], own.unbent)
+    fixed, target = targets(run)
+
+    def brought(u: Array) -> Trajectory:
+        u = run.clip(u)
+        u = steer(run, fixed, target, u)[0] if fixed else u
+        return completed(statement, mesh, parameters, u, start=own.trajectory.x[0])
+
+    first = brought(own.trajectory.u) if fixed else own.trajectory
+    return (first, *(brought(own.unbent + signs * bend) for signs in _signs(bend)))
+
+
+def _learns(statement: Statement) -> bool:
+    """Whether the cost or a condition depends on matrices, and these on how the nominal moves."""
+    if not statement.matrices or statement.coupled:
+        return False
+    paid = statement.running_uses_matrices or statement.terminal.jac_sparsity(0, 1).nnz()
+    if not paid and not any(c.size and c.function.jac_sparsity(0, 2).nnz() for c in statement.conditions):
+        return False
+    if any(statement.varies(i) for i in range(len(statement.matrices))):
+        return True
+    samples = statement.samples
+    return samples is not None and any(samples.measurement.jac_sparsity(k, i).nnz() for k in (1, 2) for i in (0, 1))
+
+
+def _signs(bend: Array) -> Iterator[Array]:
+    """Signs of the bends of the controls (nu,), other than all as they are; of those that are bent."""
+    bent = np.flatnonzero(bend.any(axis=0))
+    signs = np.ones(bend.shape[1])
+    if bent.size <= COMBINED:
+        patterns = [np.array(p) for p in product((1.0, -1.0), repeat=bent.size)][1:]
+    else:
+        patterns = [-np.ones(bent.size), *(1.0 - 2.0 * row for row in np.eye(bent.size))]
+    for pattern in patterns:
+        signs[bent] = pattern
+        yield signs.copy()
