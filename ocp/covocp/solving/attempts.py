@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
+from covocp.transcription.trajectory import Trajectory
 
 AnyOutcome = Outcome | ChainOutcome
 Found = TypeVar("Found", Outcome, Solution)
@@ -29,6 +31,8 @@ TOLD = 0.01
 # Starts that are bent to other sides: those that cost more than the cheapest by more than this share lead to no cheaper
 # minimum (of 300 random identifications none did), and those that cost the same up to this share are its mirror image.
 DEARER, SAME, MOST_SIDES = 0.25, 1e-9, 3
+# Of a problem made ready: the sides that its last run from them has compared, and from which of them its best came.
+_LED: WeakKeyDictionary[Prepared, tuple[tuple[Trajectory, ...], Guess]] = WeakKeyDictionary()
 
 
 def from_starts(
@@ -49,11 +53,11 @@ def from_starts(
     """
     runs = _Runs(prepared=prepared, values=values, reporter=reporter)
     rivals, others = _parted(guesses)
-    first = next(others, None)
-    if first is not None:
-        sided = _sides(prepared, values, first) if first.sides else [first]
-        turned = sided[0].trajectory is not first.trajectory
-        rivals, others = [*sided[1:], *rivals], chain(sided[:1], [first] if turned else [], others)
+    own = next(others, None)
+    if own is not None:
+        first, *beside = _sides(prepared, values, own) if own.sides else [own]
+        turned = first.trajectory is not own.trajectory
+        rivals, others = [*beside, *rivals], chain([first, own] if turned else [first], others)
     for count in range(TRIED):
         guess = next(others, None)
         more = guess is not None and runs.goes_on(guess)
@@ -61,11 +65,20 @@ def from_starts(
             runs.compare(rivals)
         if not more or reporter.stop or runs.trusted:
             break
-    return runs.best()
+    outcome, start = runs.best()
+    if own is not None and own.sides and start.alike and outcome.converged:
+        _LED[prepared] = own.sides, start
+    return outcome, start
 
 
 def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
-    """The start, and those bent to other sides, that are worth a run: the cheapest first, then its rivals."""
+    """The start, and those bent to other sides, that are worth a run: the cheapest first, then its rivals.
+
+    Where the same were compared before, the one that has led to the best: so it does again.
+    """
+    sides, led = _LED.get(prepared, ((), own))
+    if sides is own.sides:
+        return [replace(led, rival=False)]
     first, *mirrored = own.sides
     alone = prepared.cost(values, own.trajectory)  # first: its magnitudes are those of the program
     alone = alone if first is own.trajectory else prepared.cost(values, first)

@@ -7,6 +7,7 @@ own. What else the cost asks for, an initial state or a correlation of the prior
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.starts import First, base_run, completed, targets
+from covocp.transcription.starts import base_run, completed, own_start, stays, targets
 from covocp.transcription.steering import steer
 from covocp.transcription.trajectory import Trajectory
 
@@ -22,12 +23,21 @@ from covocp.transcription.trajectory import Trajectory
 COMBINED = 3
 
 
-def other_sides(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> tuple[Trajectory, ...]:
+def other_sides(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Trajectory, ...]:
     """The problem's own start as it is to be compared with those that are bent to other sides, and these.
+
+    The last ones are kept, as those of `own_start`.
 
     Returns:
         None where what is learnt does not depend on the side, or the start is not one that was bent.
     """
+    return (_other_sides if stays(statement) else _other_sides.__wrapped__)(statement, mesh, tuple(parameters))
+
+
+@lru_cache(maxsize=2)
+def _other_sides(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> tuple[Trajectory, ...]:
+    parameters = np.array(values)
+    own = own_start(statement, mesh, parameters)
     if own.unbent is None or own.held or not own.plain or not _learns(statement):
         return ()
     bend = own.trajectory.u - own.unbent

@@ -86,8 +86,12 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     The last ones are kept, unless a guess may have changed since (a function, an array that is filled anew): a solver
     that is asked again for the same parameters starts from the same.
     """
-    fixed = all(guess is None or is_number(guess) for guess in statement.guesses.values())
-    return (_own_start if fixed else _own_start.__wrapped__)(statement, mesh, tuple(parameters), hold)
+    return (_own_start if stays(statement) else _own_start.__wrapped__)(statement, mesh, tuple(parameters), hold)
+
+
+def stays(statement: Statement) -> bool:
+    """Whether a start is the same again, as no guess may have changed since."""
+    return all(guess is None or is_number(guess) for guess in statement.guesses.values())
 
 
 @lru_cache(maxsize=2)
