@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ from covocp.transcription.trajectory import Trajectory
 
 AnyOutcome = Outcome | ChainOutcome
 Found = TypeVar("Found", Outcome, Solution)
+Start = TypeVar("Start")
 # Starts that are tried where a method loses its way.
 TRIED = 4
 # A run has come to where a rival begins if the states differ nowhere by more than this share of how far they move.
@@ -82,19 +83,26 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
     first, *mirrored = own.sides
     alone = prepared.cost(values, own.trajectory)  # first: its magnitudes are those of the program
     alone = alone if first is own.trajectory else prepared.cost(values, first)
-    if not np.isfinite(alone):
-        return [own]
     costs = [(alone, replace(own, alike=True))]
     costs += [(prepared.cost(values, t), Guess(trajectory=t, alike=True)) for t in mirrored]
-    least = min(cost for cost, _ in costs if np.isfinite(cost))
+    found, *beside = worth_a_run(costs)
+    return [found, *(replace(guess, rival=True) for guess in beside)]
+
+
+def worth_a_run(costs: Sequence[tuple[float, Start]]) -> list[Start]:
+    """Of starts with what they cost, the problem's own first, those that are worth a run: the cheapest first."""
+    own = costs[0]
+    if not np.isfinite(own[0]):
+        return [own[1]]
+    finite = [entry for entry in costs if np.isfinite(entry[0])]
+    least = min(cost for cost, _ in finite)
     size = abs(least)
-    costs[0] = (alone - SAME * size, costs[0][1])  # before its mirror image
-    found: list[tuple[float, Guess]] = []
-    for cost, guess in sorted((entry for entry in costs if np.isfinite(entry[0])), key=lambda entry: entry[0]):
+    found: list[tuple[float, Start]] = []
+    for cost, start in sorted(finite, key=lambda entry: entry[0] - SAME * size * (entry is own)):  # before its image
         twin = any(abs(cost - other) <= 2.0 * SAME * size for other, _ in found)
         if cost - least <= DEARER * size and not twin and len(found) < MOST_SIDES:
-            found.append((cost, replace(guess, rival=bool(found))))
-    return [guess for _, guess in found]
+            found.append((cost, start))
+    return [start for _, start in found]
 
 
 def _as_told(outcome: Outcome, rival: Guess) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.errors import CovocpError, OutsideDomainError
@@ -17,7 +18,7 @@ from covocp.extremal.densities import JumpEnds, impossible_jump
 from covocp.extremal.extremal import Guess
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
-from covocp.solving.attempts import TRIED, best_of, counted
+from covocp.solving.attempts import TRIED, best_of, counted, worth_a_run
 from covocp.solving.other_minima import TURNS, unless_it_fails
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
@@ -29,8 +30,11 @@ from covocp.statement.chain import Chain, Link, started_at
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.grading import graded
+from covocp.transcription.halved_steps import refined_run
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.mirrored import COMBINED
 from covocp.transcription.stiffness import resolve_mesh
+from covocp.transcription.trajectory import Trajectory
 
 Arrays = tuple[Array, ...]
 Guesses = tuple[Guess, ...]
@@ -43,6 +47,7 @@ class Begun:
     """Where a method starts: a guess for each phase, parameters with what passes, graded options, statements.
 
     covariances: whether what each phase ends with is a covariance where it should be; else the nearest one is passed.
+    cost: of all phases along the guesses, where it was asked for.
     """
 
     chain: Chain
@@ -50,6 +55,7 @@ class Begun:
     values: Arrays
     options: tuple[Options, ...]
     covariances: bool
+    cost: float = np.nan
 
     __repr__ = short_repr
 
@@ -171,9 +177,19 @@ class ChainRuns:
         return self._prepare(begun.chain, begun.options, **self._own)
 
     def _from_starts(self, begun: Begun) -> Measured:
-        """From the first start from which the method finds its way; from the first one where there is none."""
-        prepared, values = self._prepared(begun), begun.values
-        start, tried = begun.guesses, 0
+        """What `_found` is, without turns."""
+        prepared = self._prepared(begun)
+        outcome = self._unwound(begun, prepared, self._found(begun, prepared))
+        return self._measured(begun.options, prepared, outcome)
+
+    def _found(self, begun: Begun, prepared: Any) -> ChainOutcome:
+        """From the first start from which the method finds its way; from the first one where there is none.
+
+        Where starts that are bent to other sides cost about the same, the cheapest outcome counts.
+        """
+        values = begun.values
+        (first, *beside), tried = self._sides(begun), 0
+        start = first
         for attempt in range(TRIED):
             tentative = attempt < TRIED - 1 and not any(guess.warm for guess in start)
             given = tuple(replace(guess, tentative=tentative) for guess in start)
@@ -183,10 +199,31 @@ class ChainRuns:
                 break
             start = self._begun(begun.options, attempt + 1).guesses
         if not outcome.converged and outcome.stats.get("wandered") and not self._reporter.stop:
-            outcome = prepared.solve(values, begun.guesses, self._reporter)
-        if tried > 1:
-            outcome = replace(outcome, stats={**outcome.stats, "tried": tried})
-        return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
+            outcome = prepared.solve(values, first, self._reporter)
+        for rival in beside:
+            if self._reporter.stop:
+                break
+            again, tried = prepared.solve(values, rival, self._reporter), tried + 1
+            better = again.converged and (not outcome.converged or again.cost < outcome.cost)
+            found = again if better else outcome
+            outcome = replace(found, stats={**found.stats, **counted(outcome, again)})
+        return replace(outcome, stats={**outcome.stats, "tried": tried}) if tried > 1 else outcome
+
+    def _sides(self, begun: Begun) -> list[Guesses]:
+        """The start, and those whose phases are bent to other sides, that are worth a run beside it."""
+        own, count = begun.guesses, len(begun.guesses)
+        if not any(guess.sides for guess in own):
+            return [own]
+        patterns = product((False, True), repeat=count) if count <= COMBINED else [(False,) * count, (True,) * count]
+        costs = []
+        for turned in patterns:
+            try:
+                found = self._begun(begun.options, turned=turned)
+            except OutsideDomainError:
+                continue
+            costs.append((found.cost, found.guesses if any(turned) else own))
+        # phases that begin alone know nothing of one another: what they cost tells less than of one problem
+        return [own, *(guesses for guesses in worth_a_run(costs) if guesses is not own)]
 
     def _unwound(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
         """Solved again without the turns that angles make between nodes, where that works and is cheaper."""
@@ -208,14 +245,12 @@ class ChainRuns:
         """The best of the phases' own start and of random ones, whose phases go on from where the one before ends."""
         prepared = self._prepared(begun)
 
-        def starts() -> Iterator[Guesses]:
-            yield begun.guesses
-            for k in range(count):
-                drawn = self._drawn(begun.options, count, seed, k)
-                if drawn is not None:
-                    yield drawn
+        def own() -> tuple[ChainOutcome, None]:
+            return self._found(begun, prepared), None
 
-        outcome = best_of(prepared, begun.values, starts(), count + 1, self._reporter)
+        drawn = (self._drawn(begun.options, count, seed, k) for k in range(count))
+        starts = (guesses for guesses in drawn if guesses is not None)
+        outcome = best_of(prepared, begun.values, starts, count + 1, self._reporter, own)
         return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
 
     def _drawn(self, options: tuple[Options, ...], count: int, seed: int, k: int) -> Guesses | None:
@@ -230,22 +265,29 @@ class ChainRuns:
             return None
         return None if found is None else found.guesses
 
-    def _begun(self, options: tuple[Options, ...], attempt: int = 0) -> Begun:
+    def _begun(self, options: tuple[Options, ...], attempt: int = 0, turned: tuple[bool, ...] = ()) -> Begun:
         """A guess for each phase, each of which starts where the one before it ends.
 
         The parameters have the matrices that a phase then starts with, and the weights that the next one has where it
-        begins; the options are graded for them.
+        begins; the options are graded for them. `turned`: the phases that are bent to the other side; then what they
+        cost is asked for, along starts as they are to be compared.
         """
 
         def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess:
             guesses = first_guesses(own, st, mesh, value, self._guesses[i], linked=True)
-            return list(islice(guesses, attempt + 1))[-1]
+            guess = list(islice(guesses, attempt + 1))[-1]
+            if not turned:
+                return guess
+            sides = guess.sides or (guess.trajectory,)
+            trajectory, costs[i] = _along(st, mesh, sides[-1 if turned[i] else 0], value)
+            return Guess(trajectory=trajectory)
 
+        costs: dict[int, float] = {}
         found = self._forward(options, self._values, made)
         if found is not None and any(link.weights for link in self._chain.links):
             found = self._forward(options, self._weighed(found), made)
         assert found is not None
-        return found
+        return replace(found, cost=sum(costs.values())) if turned else found
 
     def _weighed(self, begun: Begun) -> Arrays:
         """The parameters with S of each later phase along its guess, where it begins; from the last to the first."""
@@ -297,6 +339,15 @@ class ChainRuns:
             options=tuple(fine),
             covariances=covariances,
         )
+
+
+def _along(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> tuple[Trajectory, float]:
+    """A guess with the matrices that pass along it, and what it costs; NaN where that is no number."""
+    with np.errstate(all="ignore"):
+        run = refined_run(statement, mesh, guess, parameters, 1)
+        found = replace(guess, e=run.matrices) if np.isfinite(run.matrices).all() else guess
+        terminal = statement.terminal(found.x[-1], found.e[-1], found.duration, parameters)
+        return found, run.running + float(np.sum(ca.DM(terminal).full()))
 
 
 def _check_variances(link: Link, before: Statement, after: Statement, ends: JumpEnds) -> None:
