@@ -16,7 +16,7 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
-from covocp.extremal.extremal import Guess, Outcome
+from covocp.extremal.extremal import Guess, Merit, Outcome
 from covocp.extremal.links import ChainOutcome
 from covocp.passage.library import build_info
 from covocp.passage.sweep import passed_by
@@ -264,9 +264,9 @@ class ShootingSolver:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
         return self._runs.outcome(parameters, guess, progress)
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
-        return self._runs.cost((parameters,), (trajectory,))
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
+        return self._runs.merit((parameters,), (trajectory,))
 
 
 class ChainSolver:

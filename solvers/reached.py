@@ -13,7 +13,9 @@ from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, NO_SIZE, ROUNDED, VIOLATION, Residuals, complementary
 from covocp.base.short_repr import short_repr
+from covocp.extremal.extremal import Merit
 from covocp.solvers.at_point import AtPoint, Weighed
+from covocp.statement.conditions import beyond
 from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.scales import choose_scales, magnitudes, with_given
@@ -141,6 +143,16 @@ class FirstOrder:
         if outputs is None:
             raise RuntimeError("the constraints have no slopes there")
         return outputs[0], weighed(outputs[1], weights)
+
+    def merit(self, w: Array, parameters: Arrays) -> Merit:
+        """Cost, largest violation, and what the inequalities have left together, as their mirror images have."""
+        limits = self.nlp.bounds(parameters)
+        with np.errstate(all="ignore"):
+            cost = self.cost(w, parameters)[0]
+            rows = self.constraints(w, parameters, np.zeros(limits["lbg"].size))[0]
+        beside = beyond(rows, limits["lbg"], limits["ubg"])
+        worst = max(float(own.max(initial=0.0)) for own in (beside, beyond(w, limits["lbx"], limits["ubx"])))
+        return Merit(cost, worst, float(beside[limits["lbg"] < limits["ubg"]].sum()))
 
 
 def reached_scales(nlp: Program, trajectories: Trajectories, parameters: Arrays, *, again: bool) -> Magnitudes:

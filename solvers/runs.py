@@ -15,7 +15,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
-from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
+from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Merit, Outcome
 from covocp.solvers.at_point import AtPoint, Nodes
 from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
@@ -156,12 +156,10 @@ class Runs:
         counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
-    def cost(self, parameters: Arrays, trajectories: Trajectories) -> float:
-        """What the variables of some trajectories cost, in the program that they would be solved in; NaN: no number."""
+    def merit(self, parameters: Arrays, trajectories: Trajectories) -> Merit:
+        """Of trajectories, in the program that they would be solved in."""
         nlp, _ = self._build(None, trajectories, parameters, False, False)
-        with np.errstate(all="ignore"):
-            value = float(self._first_order().cost(nlp.pack(trajectories), parameters)[0])
-        return value if np.isfinite(value) else np.nan
+        return self._first_order().merit(nlp.pack(trajectories), parameters)
 
     def _rounds(self, nlp: Program, first: Point, parameters: Arrays, progress: Progress) -> list[Round]:
         """The first run judged in the scale of the point it reached, and further ones from there until that holds.

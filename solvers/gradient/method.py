@@ -39,7 +39,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.decisions import with_tied_multipliers
-from covocp.extremal.extremal import Extremal, Guess, Outcome
+from covocp.extremal.extremal import Extremal, Guess, Merit, Outcome
 from covocp.solvers.gradient.chain_method import GradientChainSolver, check_domain, check_phases
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
@@ -288,12 +288,14 @@ class GradientSolver:
             },
         )
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
+        guess = Guess(trajectory=trajectory)
         with np.errstate(all="ignore"):
-            guess = Guess(trajectory=trajectory)
-            value = float(self.space(parameters, guess).first(guess).run.cost)
-        return value if np.isfinite(value) else np.nan
+            iterate = self.space(parameters, guess).first(guess)
+        excess = max((float(np.max(own, initial=0.0)) for own in iterate.penalty.excess), default=0.0)
+        last = iterate.run.z[-1, self._statement.nx :]  # covariances
+        return Merit(float(iterate.run.cost), excess, float(np.abs(last).sum()))
 
     def space(self, parameters: Array, guess: Guess) -> Space:
         """The unknowns of the method for these parameters, with the compiled sweeps."""

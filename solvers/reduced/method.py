@@ -18,7 +18,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
-from covocp.extremal.extremal import Guess, Outcome
+from covocp.extremal.extremal import Guess, Merit, Outcome
 from covocp.passage.sweep import passed_by
 from covocp.solvers.at_point import AtPoint
 from covocp.solvers.endings import Ending
@@ -203,6 +203,6 @@ class ReducedSolver:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
         return self._runs.outcome(parameters, guess, progress)
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
-        return self._runs.cost((parameters,), (trajectory,))
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
+        return self._runs.merit((parameters,), (trajectory,))

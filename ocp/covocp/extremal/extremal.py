@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -131,6 +131,17 @@ class Outcome:
     __repr__ = short_repr
 
 
+class Merit(NamedTuple):
+    """What a trajectory costs, its largest violation in units of the rows; NaN where they are no numbers.
+
+    mark: a number of the same method that mirror images share, and starts that only cost the same do not.
+    """
+
+    cost: float
+    violation: float
+    mark: float
+
+
 class Prepared(Protocol):
     """What `prepare` of a method's module returns: the problem made ready, solved as often as wanted."""
 
@@ -141,8 +152,8 @@ class Prepared(Protocol):
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess."""
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
 
 
 @dataclass(frozen=True, kw_only=True)

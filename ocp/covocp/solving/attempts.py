@@ -14,7 +14,7 @@ from covocp.base.errors import Interrupted, OutsideDomainError, ProblemError, wa
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
-from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
@@ -32,6 +32,8 @@ TOLD = 0.01
 # Starts that are bent to other sides: those that cost more than the cheapest by more than this share lead to no cheaper
 # minimum (of 300 random identifications none did), and those that cost the same up to this share are its mirror image.
 DEARER, SAME, MOST_SIDES = 0.25, 1e-9, 3
+# A violation of conditions that is little, in units of their rows.
+LITTLE = 1e-2
 # Of a problem made ready: the sides that its last run from them has compared, and from which of them its best came.
 _LED: WeakKeyDictionary[Prepared, tuple[tuple[Trajectory, ...], Guess]] = WeakKeyDictionary()
 
@@ -81,27 +83,40 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
     if sides is own.sides:
         return [replace(led, rival=False)]
     first, *mirrored = own.sides
-    alone = prepared.cost(values, own.trajectory)  # first: its magnitudes are those of the program
-    alone = alone if first is own.trajectory else prepared.cost(values, first)
-    costs = [(alone, replace(own, alike=True))]
-    costs += [(prepared.cost(values, t), Guess(trajectory=t, alike=True)) for t in mirrored]
-    found, *beside = worth_a_run(costs)
+    alone = prepared.merit(values, own.trajectory)  # first: its magnitudes are those of the program
+    alone = alone if first is own.trajectory else prepared.merit(values, first)
+    merits = [(alone, replace(own, alike=True))]
+    merits += [(prepared.merit(values, t), Guess(trajectory=t, alike=True)) for t in mirrored]
+    found, *beside = worth_a_run(merits)
     return [found, *(replace(guess, rival=True) for guess in beside)]
 
 
-def worth_a_run(costs: Sequence[tuple[float, Start]]) -> list[Start]:
-    """Of starts with what they cost, the problem's own first, those that are worth a run: the cheapest first."""
-    own = costs[0]
-    if not np.isfinite(own[0]):
+def worth_a_run(merits: Sequence[tuple[Merit, Start]]) -> list[Start]:
+    """Of starts with their merits, the problem's own first, those that are worth a run: the best first.
+
+    Where they violate conditions by more than a little, what they cost as they begin leaves none out.
+    """
+    own = merits[0]
+    if not np.isfinite(own[0]).all():
         return [own[1]]
-    finite = [entry for entry in costs if np.isfinite(entry[0])]
-    least = min(cost for cost, _ in finite)
+    finite = [entry for entry in merits if np.isfinite(entry[0]).all()]
+    little = max(merit.violation for merit, _ in finite) <= LITTLE
+    least = min(merit.cost for merit, _ in finite)
     size = abs(least)
-    found: list[tuple[float, Start]] = []
-    for cost, start in sorted(finite, key=lambda entry: entry[0] - SAME * size * (entry is own)):  # before its image
-        twin = any(abs(cost - other) <= 2.0 * SAME * size for other, _ in found)
-        if cost - least <= DEARER * size and not twin and len(found) < MOST_SIDES:
-            found.append((cost, start))
+
+    def order(entry: tuple[Merit, Start]) -> tuple[float, float]:
+        before = SAME * (entry is own)  # its mirror image
+        return 0.0 if little else entry[0].violation - before, entry[0].cost - before * size
+
+    def alike(one: Merit, other: Merit) -> bool:
+        conditions = max(abs(one.violation - other.violation), abs(one.mark - other.mark) / max(1.0, abs(one.mark)))
+        return abs(one.cost - other.cost) <= 2.0 * SAME * size and conditions <= 2.0 * SAME
+
+    found: list[tuple[Merit, Start]] = []
+    for merit, start in sorted(finite, key=order):
+        near = not little or merit.cost - least <= DEARER * size
+        if near and len(found) < MOST_SIDES and not any(alike(merit, other) for other, _ in found):
+            found.append((merit, start))
     return [start for _, start in found]
 
 

@@ -10,7 +10,7 @@ from covocp.base.arguments import checked, optional, positive, whole
 from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
@@ -125,9 +125,9 @@ class Automatic:
                 spent = float(outcome.stats.get("solve_seconds", 0.0))
         return _named(self._ipopt.solve(parameters, guess, progress), "ipopt", spent)
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
-        return (self._reduced or self._ipopt).cost(parameters, trajectory)
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
+        return (self._reduced or self._ipopt).merit(parameters, trajectory)
 
 
 def _named(outcome: Outcome, method: str, spent: float) -> Outcome:

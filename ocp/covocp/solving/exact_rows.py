@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
+from covocp.extremal.extremal import Extremal, Guess, Merit, Outcome, Prepared
 from covocp.solving.methods import METHODS
 from covocp.statement.exact_rows import Carried, carried
 from covocp.statement.statement import Statement
@@ -70,9 +70,9 @@ class WithoutRows:
             ),
         )
 
-    def cost(self, parameters: Array, trajectory: Trajectory) -> float:
-        """What the controls of a trajectory cost; NaN where that is no number."""
-        return self._prepared.cost(parameters, self._taken(trajectory))
+    def merit(self, parameters: Array, trajectory: Trajectory) -> Merit:
+        """What the controls of a trajectory cost, and how they meet the conditions."""
+        return self._prepared.merit(parameters, self._taken(trajectory))
 
     def _taken(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory without the rows."""

@@ -15,7 +15,7 @@ from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.densities import JumpEnds, impossible_jump
-from covocp.extremal.extremal import Guess
+from covocp.extremal.extremal import Guess, Merit
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.solving.attempts import TRIED, best_of, counted, worth_a_run
@@ -221,7 +221,7 @@ class ChainRuns:
                 found = self._begun(begun.options, turned=turned)
             except OutsideDomainError:
                 continue
-            costs.append((found.cost, found.guesses if any(turned) else own))
+            costs.append((Merit(found.cost, 0.0, 0.0), found.guesses if any(turned) else own))
         # phases that begin alone know nothing of one another: what they cost tells less than of one problem
         return [own, *(guesses for guesses in worth_a_run(costs) if guesses is not own)]
 

@@ -1,0 +1,153 @@
+"""Minima on both sides of what is learnt: mirror images cost the same, and the cheaper side is found."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.extremal.extremal import Merit
+from covocp.solving.attempts import worth_a_run
+
+OPTIONS = {"intervals": 40, "progress": False}
+
+
+def lag(start: float, final: float | None = None, mean: float = 0.2, limit: float | None = None) -> co.Problem:
+    """x' = -b x + u: with -x and -u for x and u, E_xb turns its sign, and the cost is the same."""
+    ocp = co.Problem(5.0)
+    x = ocp.state("x", initial=start, final=final)
+    b = ocp.unknown("b", mean=mean, variance=2.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=0.1)
+    ocp.measurement("y", x, noise=0.1)
+    E = ocp.estimation_covariance(np.diag([0.5, 2.0]))
+    if limit is None:
+        ocp.minimize(running=0.5 * u**2, terminal=10 * E[b, b])
+    else:
+        ocp.minimize(running=0.5 * u**2)
+        ocp.subject_to(E[b, b], at="final", upper=limit)
+    return ocp
+
+
+def dragged(speed: float) -> co.Problem:
+    """v' = u - c v |v| with an unknown drag."""
+    ocp = co.Problem(5.0)
+    v = ocp.state("v", initial=speed, final=0.0, variance=0.1)
+    c = ocp.unknown("c", mean=0.5, variance=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(v, u - c * v * ca.fabs(v), noise=0.05)
+    ocp.measurement("y", v, noise=0.1)
+    ocp.minimize(0.5 * u**2, 10 * ocp.estimation_covariance()[c, c])
+    return ocp
+
+
+def lags(first: float, second: float) -> co.Problem:
+    """Two lags that act on one another, with a control each."""
+    ocp = co.Problem(4.0)
+    x = ocp.state("x", shape=2, initial=np.array([first, second]), variance=0.1)
+    a, b = (ocp.unknown(name, mean=mean, variance=1.0) for name, mean in (("a", 0.5), ("b", 1.0)))
+    u = ocp.control("u", shape=2)
+    ocp.dynamics(x, ca.vertcat(-a * x[0] + 0.3 * x[1] + u[0], -b * x[1] + u[1]), noise=0.05)
+    ocp.measurement("y", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(0.5 * ca.sumsqr(u), 5 * (E[a, a] + E[b, b]))
+    return ocp
+
+
+def guessed(problem: co.Problem, value: float) -> float:
+    """What comes of controls that begin on one side."""
+    guess = {name: np.tile(value, 41) for name in ("u",)}
+    return co.solve(problem, guess=guess, **OPTIONS).cost
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_mirror_images_cost_the_same(method):
+    """0.3802: by BFGS on nine knots along a Riccati equation of scipy; the other minimum is at 1.3800."""
+    costs = [co.solve(lag(start), method, **OPTIONS).cost for start in (1.0, -1.0)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-6)
+    assert costs[0] == pytest.approx(0.3802, abs=2e-4)
+
+
+@pytest.mark.parametrize(("start", "final", "mean"), [(-1.0, 0.0, 1.0), (0.5, 0.0, 1.0), (-0.3, -0.5, 0.2)])
+def test_the_cheaper_side_is_found_with_final_values(start, final, mean):
+    least = min(guessed(lag(start, final, mean), side) for side in (1.0, -1.0, 2.0, -2.0))
+    assert co.solve(lag(start, final, mean), **OPTIONS).cost <= least * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("speed", [1.0, -1.0, 0.3])
+def test_the_cheaper_side_of_a_car_is_found(speed):
+    least = min(guessed(dragged(speed), side) for side in (1.0, -1.0))
+    assert co.solve(dragged(speed), **OPTIONS).cost <= least * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_a_limit_of_a_variance_is_met_on_the_cheaper_side(method):
+    """Both starts cost the same; which is cheaper tells only what they learn."""
+    costs = [co.solve(lag(start, limit=0.08), method, **OPTIONS).cost for start in (-0.3, 0.3)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-5)
+    assert costs[0] <= min(guessed(lag(-0.3, limit=0.08), side) for side in (1.0, -1.0)) * (1 + 1e-5)
+
+
+def test_each_control_has_sides_of_its_own():
+    """The best of random starts is the reference: each pair of signs leads to a minimum of its own."""
+    costs = [co.solve(lags(first, second), **OPTIONS).cost for first in (0.5, -0.5) for second in (0.4, -0.4)]
+    best = co.solve(lags(0.5, -0.4), guess="multistart", starts=6, **OPTIONS).cost
+    assert costs[1] <= best * (1 + 1e-6)
+    assert costs[0] == pytest.approx(costs[3], rel=1e-6)  # mirror images
+    assert costs[1] == pytest.approx(costs[2], rel=1e-6)
+
+
+def test_a_symmetric_problem_is_solved_once():
+    assert "tried" not in co.solve(lag(0.0), **OPTIONS).stats
+
+
+def test_the_side_that_was_best_is_taken_again():
+    solver = co.Solver(lag(0.1), "ipopt", intervals=40)
+    first = solver.solve(progress=False)
+    again = solver.solve(progress=False)
+    assert first.stats["tried"] == 2
+    assert "tried" not in again.stats
+    assert again.cost == pytest.approx(first.cost, rel=1e-9)
+
+
+def test_phases_find_the_side_of_one_problem():
+    parts = []
+    for length, start, final in ((0.5, 1.0, None), (4.5, None, 0.0)):
+        ocp = co.Problem(length)
+        x = ocp.state("x", initial=start, final=final, variance=0.5 if start else None)
+        b = ocp.unknown("b", mean=1.0, variance=2.0)
+        u = ocp.control("u")
+        ocp.dynamics(x, -b * x + u, noise=0.1)
+        ocp.measurement("y", x, noise=0.1)
+        E = ocp.estimation_covariance()
+        ocp.minimize(0.5 * u**2, 10 * E[b, b] if final is not None else 0.0)
+        parts.append(ocp)
+    whole = co.solve(lag(1.0, 0.0, 1.0), intervals=100, progress=False).cost
+    assert co.solve(co.Phases(parts), progress=False).cost == pytest.approx(whole, rel=1e-4)
+
+
+def test_random_starts_begin_with_all_that_the_default_tries():
+    """The ways round an obstacle, which random starts had in place of the problem's own."""
+    ocp = co.Problem(co.Free(12.0, 1.0, 40.0))
+    p = ocp.state("p", shape=2, initial=[0.0, 0.0], final=[10.0, 0.0])
+    heading = ocp.state("heading", initial=None, guess=0.0, lower=-6.0, upper=6.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(p, ca.vertcat(ca.cos(heading), ca.sin(heading)))
+    ocp.dynamics(heading, u)
+    ocp.subject_to((p[0] - 5.0) ** 2 + (p[1] - 0.5) ** 2, lower=4.0)
+    ocp.minimize(running=1e-3 * u**2, terminal=ocp.duration)
+    default = co.solve(ocp, **OPTIONS).cost
+    assert co.solve(ocp, guess="multistart", starts=2, **OPTIONS).cost <= default * (1 + 1e-6)
+
+
+def test_what_is_worth_a_run():
+    """The cheapest first; not those that are far dearer, nor mirror images; all where conditions are violated."""
+    own, image, near, far = Merit(2.0, 0.0, 1.0), Merit(2.0, 0.0, 1.0), Merit(1.8, 0.0, 1.0), Merit(5.0, 0.0, 1.0)
+    assert worth_a_run([(own, "own"), (image, "image")]) == ["own"]
+    assert worth_a_run([(own, "own"), (far, "far"), (near, "near")]) == ["near", "own"]
+    other = Merit(2.0, 0.0, 1.5)  # the same cost, but other variances
+    assert worth_a_run([(own, "own"), (other, "other")]) == ["own", "other"]
+    wrong = [(Merit(2.0, 0.5, 0.0), "own"), (Merit(9.0, 0.2, 0.0), "other")]
+    assert worth_a_run(wrong) == ["other", "own"]
+    assert worth_a_run([(Merit(np.nan, 0.0, 0.0), "own"), (near, "near")]) == ["own"]
