@@ -18,7 +18,7 @@ from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
-from covocp.transcription.trajectory import Trajectory
+from covocp.transcription.trajectory import Trajectory, between
 
 AnyOutcome = Outcome | ChainOutcome
 Found = TypeVar("Found", Outcome, Solution)
@@ -32,6 +32,8 @@ TOLD = 0.01
 # Starts that are bent to other sides: those that cost more than the cheapest by more than this share lead to no cheaper
 # minimum (of 300 random identifications none did), and those that cost the same up to this share are its mirror image.
 DEARER, SAME, MOST_SIDES = 0.25, 1e-9, 3
+# Places on the way from where a rival begins to what was found at which the cost is looked at.
+ALONG = (0.0, 1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)
 # A violation of conditions that is little, in units of their rows.
 LITTLE = 1e-2
 # Of a problem made ready: the sides that its last run from them has compared, and from which of them its best came.
@@ -178,9 +180,21 @@ class _Runs:
             if self.reporter.stop:
                 break
             least = min((cost_of(one) for one, _ in self.tried if one.converged), default=np.inf)
-            if self._led(rival) is None and not (self.trusted and rival.about >= least):
+            certain = self._led(rival) is not None or (self.trusted and rival.about >= least)
+            if not certain and not (rival.alike and self._falls_to_best(rival)):
                 outcome = self.run(rival)
                 self.trusted |= outcome is not None and outcome.converged and _as_told(outcome, rival)
+
+    def _falls_to_best(self, rival: Guess) -> bool:
+        """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley."""
+        found = [outcome for outcome, _ in self.tried if outcome.converged]
+        if not found:
+            return False
+        best = min(found, key=cost_of)
+        end, begins = best.extremal.trajectory, rival.trajectory
+        merits = [self.prepared.merit(self.values, between(begins, end, share)) for share in ALONG]
+        costs = [*(merit.cost for merit in merits), cost_of(best)]
+        return bool(np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())
 
     def _led(self, rival: Guess) -> Outcome | None:
         """A run that has come about to where a rival begins."""

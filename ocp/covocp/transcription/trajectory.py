@@ -25,6 +25,16 @@ class Trajectory:
     __repr__ = short_repr
 
 
+def between(one: Trajectory, other: Trajectory, share: float) -> Trajectory:
+    """What lies at a share of the straight way from one trajectory to another on the same mesh."""
+
+    def at(first: Array, last: Array) -> Array:
+        return np.asarray(first + share * (last - first))
+
+    duration = one.duration + share * (other.duration - one.duration)
+    return Trajectory(x=at(one.x, other.x), u=at(one.u, other.u), e=at(one.e, other.e), duration=duration)
+
+
 def at_nodes(u: Array, nodes: int) -> Array:
     """Control values at all nodes; a constant control holds its last value at the last node."""
     return u if u.shape[0] == nodes else np.vstack([u, u[-1:]])
