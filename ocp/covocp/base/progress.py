@@ -148,5 +148,7 @@ class Progress:
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
+            if callable(self._previous):  # which may note it, where CasADi would lose it
+                self._previous(number, frame)
             raise KeyboardInterrupt
         self.asked = True
