@@ -75,8 +75,8 @@ def _of_another(solution: Solution, statement: Statement, found: list[Difference
         f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
         expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
         received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
-        remedy=f"give the problem that was solved, or load without one; {own}evaluate(problem, nominal=load(path)) tells "
-        "what the stored nominal means for another problem",
+        remedy=f"give the problem that was solved, or load without one; {own}evaluate(problem, nominal=load(path)) "
+        "tells what the stored nominal means for another problem",
     )
 
 
