@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from fractions import Fraction
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import covocp as co
-from covocp.base.checks import check_density
+from covocp.base.checks import check_density, density_matrix
 
 
 def exact_determinant(matrix):
@@ -57,6 +58,26 @@ def test_small_entries_that_differ_are_not_symmetric():
     """Beside 1e6 entries of 1e-7 and 2e-7 had been the same but for rounding; in their units they are 0.1 and 0.2."""
     with pytest.raises(co.ProblemError, match="is not symmetric"):
         check_density("x", "variance", np.array([[1e6, 0, 0], [0, 1e-6, 1e-7], [0, 2e-7, 1e-6]]), definite=False)
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e6, 1e-6), (1e-9, 1e-9)])
+@pytest.mark.parametrize("correlation", [0.0, 0.3])
+def test_rounding_of_a_covariance_is_no_asymmetry(units, correlation):
+    """A share of sqrt(P_ii P_jj), whatever the entry itself is: 1e-12 beside 0.1 and 0.3 had been too much."""
+    D, apart = np.diag(units), np.sqrt(0.1 * 0.3)
+    even = np.array([[0.1, correlation * apart], [correlation * apart, 0.3]])
+    for share, allowed in ((1e-12, True), (9e-10, True), (1.1e-9, False), (1e-6, False)):
+        uneven = D @ (even + np.array([[0.0, share * apart], [0.0, 0.0]])) @ D
+        if allowed:
+            check_density("x", "variance", uneven, definite=True)
+            taken = ca.evalf(density_matrix("x", "variance", uneven, 2)).full()
+            np.testing.assert_array_equal(taken, (uneven + uneven.T) / 2)
+            continue
+        with pytest.raises(co.ProblemError, match="is not symmetric") as refused:
+            check_density("x", "variance", uneven, definite=True)
+        assert refused.value.remedy.startswith("give (P + P.T) / 2 where the difference is rounding")
+        told = float(refused.value.received.rpartition("entries [0, 1] and [1, 0] differ by ")[2])
+        assert told == pytest.approx(share * apart * units[0] * units[1], rel=1e-2)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])

@@ -73,3 +73,38 @@ def test_root_mean_squares_of_phases_have_all_parts() -> None:
         for (t, y), matrix in zip(drawn[3 * k : 3 * k + 3], (loop.X, loop.E, loop.Xhat), strict=True):
             assert y[np.isin(t, times)] == pytest.approx(np.sqrt(matrix[:, 0, 0]), rel=1e-9)
     assert entries_of(panels(plot_solutions([loops[0], loops[0]], "rms"))["rms of x"]) == list(PARTS[:2])
+
+
+def pushed(name: str, bound: float, *, initial: float | None = None, final: float | None = None) -> co.Problem:
+    """A second in which u, at most some bound, moves x as far as it can."""
+    problem = co.Problem(1.0, name)
+    x = problem.state("x", initial=initial, final=final)
+    u = problem.control("u", lower=-bound, upper=bound)
+    problem.dynamics(x, u)
+    problem.minimize(running=1e-3 * u**2, terminal=(x - 50.0) ** 2)
+    return problem
+
+
+def stretches(axes) -> list[tuple[float, float, float]]:
+    """Begin, end and height of the horizontal lines that are bounds."""
+    lines = [line.get_data() for line in axes.lines if line.get_color() == "#666666"]
+    return sorted((float(t[0]), float(t[1]), float(y[0])) for t, y in lines if y[0] == y[1])
+
+
+def test_bounds_are_drawn_along_the_phases_that_have_them() -> None:
+    phases = [pushed("a", 3.0, initial=0.0), pushed("b", 0.5), pushed("c", 3.0)]
+    solution = co.solve(co.Phases(phases, "three"), intervals=4, progress=False)
+    (axes,) = solution.plot("u").axes
+    np.testing.assert_allclose(
+        stretches(axes), [(0.0, 1.0, 3.0), (1.0, 2.0, 0.5), (2.0, 3.0, 3.0)], atol=1e-4
+    )  # -0.5, -3: far away
+    (axes,) = solution.plot("u", over="x").axes
+    np.testing.assert_allclose(stretches(axes), [(0.0, 3.0, 3.0), (3.0, 3.5, 0.5), (3.5, 6.5, 3.0)], atol=1e-4)
+    (axes,) = solution["b"].plot("u").axes
+    assert stretches(axes)[-1] == pytest.approx((0.0, 1.0, 0.5))
+
+
+def test_bounds_of_all_solutions_compared_are_drawn() -> None:
+    solutions = [co.solve(pushed(str(b), b, initial=0.0), intervals=4, progress=False) for b in (3.0, 2.5, 3.0)]
+    (axes,) = plot_solutions(solutions, "u").axes
+    np.testing.assert_allclose(stretches(axes), [(0.0, 1.0, 2.5), (0.0, 1.0, 3.0)], atol=1e-4)

@@ -1,8 +1,10 @@
 """Simulations in other processes: the same numbers; what fails or is interrupted does not take the rest with it."""
 
 import concurrent.futures
+import copy
 import multiprocessing
 import os
+import pickle
 import signal
 
 import numpy as np
@@ -220,3 +222,20 @@ def test_an_interrupt_while_the_step_is_chosen_is_one(lag, monkeypatch):
     monkeypatch.setattr(step_choice, "run_batch", interrupted)
     with pytest.raises(KeyboardInterrupt):
         simulate(lag, 64, 1, progress=False)
+
+
+def test_a_result_that_was_sent_to_another_process_knows_names(lag, here):
+    again = pickle.loads(pickle.dumps(here))
+    assert_same(again, here)
+    assert str(again) == str(here)
+    assert (again.violations, again.chances, again.verdict) == (here.violations, here.chances, here.verdict)
+    (state, *_) = [block.name for block in here.blocks if block.kind == "state"]
+    assert np.array_equal(again.covariance(state), here.covariance(here.symbols[state]))
+    assert again.to_dict().keys() == here.to_dict().keys()
+    assert len(again.plot().axes) == len(here.plot().axes)
+    with pytest.raises(ProblemError, match="sent to another process") as caught:
+        again.deviation(here.symbols[state])
+    assert caught.value.remedy == f"give the name as a string: '{state}'"
+    assert copy.deepcopy(here).symbols == here.symbols  # within a process nothing is lost
+    sample = lag.at([0.0, 1.0])
+    assert np.array_equal(pickle.loads(pickle.dumps(sample))[state], sample[sample.symbols[state]])

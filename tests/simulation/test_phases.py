@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,7 @@ def test_runs_do_not_depend_on_batches_or_executors(bounced: Any) -> None:
         np.testing.assert_array_equal(here[k].deviations, parts[k].deviations)
         np.testing.assert_array_equal(here[k].estimates, there[k].estimates)
         np.testing.assert_array_equal(here[k].moments.product, there[k].moments.product)
+    assert str(pickle.loads(pickle.dumps(here))) == str(here)
 
 
 def test_who_left_the_domain_stays_outside(bounced: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,6 +61,23 @@ def test_simulations_and_evaluations_start_from_there(tmp_path):
     assert again.cost == pytest.approx(fresh.cost, rel=1e-8)
 
 
+def test_a_plan_of_another_duration_is_loaded_with_the_problem_of_that_duration(tmp_path):
+    def problem(duration: float) -> co.Problem:
+        ocp = co.Problem(duration)
+        x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2)
+        return ocp
+
+    path = co.Solver(problem(2.0), intervals=4).solve(initial={"x": 0.5}, duration=1.6).save(tmp_path / "plan.npz")
+    for given, duration in ((co.movable(problem(2.0)), " stated with a duration of 1.6 s"), (problem(1.6), "")):
+        with pytest.raises(co.ProblemError, match="of another problem") as refused:
+            co.load(path, given)
+        assert "loaded with movable(problem)" in refused.value.remedy
+        assert duration in refused.value.remedy
+    assert co.load(path, co.movable(problem(1.6))).cost == pytest.approx(0.5**2 / 1.6)
+
+
 def _values(solution: co.Solution):
     """Parameters of a solution by name."""
     for block in solution.blocks:

@@ -12,6 +12,7 @@ import numpy as np
 import phased
 import phased_loops
 import pytest
+from read_again import printed
 from scipy.integrate import solve_ivp
 from scipy.stats import norm
 
@@ -131,8 +132,8 @@ def test_along_a_solution_of_the_phases() -> None:
 def test_what_was_evaluated_is_kept_and_simulated(tmp_path: Path) -> None:
     found = co.evaluate(phased_loops.bounce(), nominal=PUSHES, intervals=20)
     path = found.save(tmp_path / "bounce.json")
-    for read in (co.load(path), co.load(path, phased_loops.bounce())):
-        assert str(read) == str(found)
+    for read, alone in ((co.load(path), True), (co.load(path, phased_loops.bounce()), False)):
+        assert printed(read, alone=alone) == str(found)
     assert co.simulate(found, 400, seed=3, **QUIET).holds
     truth = phased_loops.bounce()
     other = co.evaluate(co.load(path, phased_loops.bounce()), truth=truth)

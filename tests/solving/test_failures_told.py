@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import pytest
 from scipy import stats
 
 import covocp as co
+from covocp.base.progress import Progress
 from covocp.solution.report import stated_first
 from covocp.solving.decisions import bent_cost
 
@@ -117,3 +120,36 @@ def test_a_gain_is_no_kink_of_the_user() -> None:
         told = bent_cost(replace(along, violations={}))
         assert ("in 'u' (abs)" in told) is bent
         assert bent or not told
+
+
+@pytest.mark.parametrize("limit", [0.6, 0.7])
+def test_what_an_integral_may_be_is_missed_by_what_is_missing(limit):
+    """An oscillator is brought to v(T) = 0: int u^2 >= (p0 sin T - v0 cos T)^2 / int cos^2, by Cauchy and Schwarz.
+
+    From 0.7 the run goes to the largest number of iterations, from 0.6 it converges to a point of local infeasibility.
+    """
+    T, p0, v0 = 4.5, 1.42607113, 0.01696409
+    problem = co.Problem(T, "oscillator")
+    p = problem.state("p", initial=p0)
+    v = problem.state("v", initial=v0, final=0.0)
+    u = problem.control("u", lower=-2.0, upper=2.0)
+    problem.dynamics(p, v)
+    problem.dynamics(v, u - p)
+    problem.subject_to(problem.integral(u**2, name="energy"), upper=limit, name="battery")
+    problem.minimize(running=p**2)
+    with pytest.raises(co.SolveError, match="the constraints may contradict") as told:
+        co.solve(problem, intervals=40, progress=False)
+    least = (p0 * np.sin(T) - v0 * np.cos(T)) ** 2 / (T / 2 + np.sin(2 * T) / 4)
+    assert told.value.violations["battery"] == pytest.approx(least - limit, rel=0.1)
+    assert re.search(r"largest violation:\n +battery: 0", str(told.value))
+
+
+def test_a_violation_that_has_not_fallen_for_long_is_counted():
+    progress = Progress("", show=False)
+    for first, violations in ((0, [1.0, 0.5, *[0.5] * 150]), (1, [1.0, 0.0, 1.0]), (0, np.geomspace(1.0, 1e-3, 300))):
+        for k, violation in enumerate(violations, first):
+            progress.update(k, 0.0, violation)
+    assert progress.stalled(151) == 150  # of an earlier run
+    assert progress.stalled(3) == 0  # it came to where nothing is violated
+    assert progress.stalled(299) < 10
+    assert progress.stalled(77) == 0  # there was none

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
-from covocp.base.threads import one_at_a_time
+from covocp.base.threads import briefly
 
 
 class Buffered:
@@ -59,7 +59,7 @@ class Matrices(Buffered):
         self._shapes = [function.size_out(i) for i in range(function.n_out())]
         super().__init__(function)
 
-    @one_at_a_time
+    @briefly
     def evaluated(self, *arguments: Array | float) -> list[Array]:
         """The outputs.
 

@@ -15,8 +15,10 @@ from covocp.base.errors import ProblemError, kind_and_name, shown
 from covocp.base.expressions import Given, trial_values
 from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers, without_rounding
 
-# Share of its largest entry by which a matrix may differ from its transpose.
+# Share of its largest entry by which a matrix may differ from its transpose; of a covariance entry [i, j] by this share
+# of the root of the variances i and j, whatever their units.
 SYMMETRIC = 1e-9
+UNEVEN = "is not symmetric"
 
 
 def caller() -> str:
@@ -167,7 +169,7 @@ def density_matrix(name: str, what: str, value: Given, size: int) -> Any:
     if numbers.shape != (size, size):
         raise shape_error(name, what, expected, f"shape {numbers.shape}")
     check_density(name, what, numbers, definite=False)
-    full = ca.DM(numbers)
+    full = ca.DM(0.5 * (numbers + numbers.T))
     return ca.MX(ca.project(full, ca.Sparsity.diag(size) + ca.sparsify(full).sparsity()))
 
 
@@ -211,9 +213,24 @@ def check_symmetric_numbers(name: str, what: str, numbers: Array) -> None:
     raise ProblemError(
         f"The {what} of '{name}' is not symmetric." if finite else f"The {what} of '{name}' contains NaN or inf.",
         expected="a number" if numbers.size == 1 else "a symmetric matrix",
-        received=np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12),
-        remedy=f"check the {what} given for '{name}'",
+        received=_with_difference(numbers),
+        remedy=_made_even(name, what) if finite else f"check the {what} given for '{name}'",
     )
+
+
+def _with_difference(numbers: Array) -> str:
+    """A matrix as it is printed, and by how much it differs most from its transpose, which its digits may not show."""
+    text = np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12)
+    if not np.isfinite(numbers).all() or np.array_equal(numbers, numbers.T):
+        return text
+    difference = np.triu(np.abs(numbers - numbers.T))
+    relative = over_units(difference, own_units(numbers, negative=True))
+    i, j = (int(k) for k in np.unravel_index(int(np.argmax(relative)), relative.shape))
+    return f"{text}, entries [{i}, {j}] and [{j}, {i}] differ by {difference[i, j]:.3g}"
+
+
+def _made_even(name: str, what: str) -> str:
+    return f"give (P + P.T) / 2 where the difference is rounding; else correct the {what} given for '{name}'"
 
 
 def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
@@ -266,12 +283,14 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
     if problem:
         number = f"a {'positive' if definite else 'nonnegative'} number"
         matrix = f"a symmetric positive {'definite' if definite else 'semidefinite'} matrix"
-        text = np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12)
+        uneven = problem == UNEVEN
         raise ProblemError(
             f"The {what} of '{name}' {problem}.",
             expected=number if scalar else matrix,
-            received=f"{float(numbers.item()):g}" if scalar else text,
-            remedy=f"check the {what} given for '{name}'"
+            received=f"{float(numbers.item()):g}" if scalar else _with_difference(numbers),
+            remedy=_made_even(name, what)
+            if uneven
+            else f"check the {what} given for '{name}'"
             + (": every measurement needs some noise" if definite and "noise" in what else ""),
         )
 
@@ -285,8 +304,9 @@ def _indefinite(numbers: Array, definite: bool) -> str:
     if alone and (diagonal > 0 if definite else diagonal >= 0).all():
         return ""
     scaled = over_units(numbers, own_units(numbers, negative=True))  # entries 10^18 apart say nothing of each other
-    if not np.allclose(scaled, scaled.T, rtol=1e-9, atol=1e-12):
-        return "is not symmetric"
+    if (np.abs(scaled - scaled.T) > SYMMETRIC * np.maximum(1.0, np.abs(scaled))).any():
+        return UNEVEN
+    scaled = 0.5 * (scaled + scaled.T)
     values, scalar = np.linalg.eigvalsh(scaled), numbers.size == 1
     largest = float(np.abs(values).max())
     plain = float(np.linalg.eigvalsh(numbers)[0])

@@ -39,8 +39,16 @@ class CovocpError(Exception):
         self.problem, self.expected, self.received, self.remedy = problem, expected, received, remedy
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """As it was made, in another process too: what is kept beside the message is set again."""
-        return _remade, (type(self), self.problem, self.__dict__)
+        """As it was made, in another process too: what is kept beside the message is set again, where it can be."""
+        return _remade, (type(self), self.problem, _travelling(self.__dict__))
+
+    def __copy__(self) -> CovocpError:
+        """With everything that is kept beside the message, within a process."""
+        return _remade(type(self), self.problem, self.__dict__)
+
+    def __deepcopy__(self, memo: object) -> CovocpError:
+        """As `copy.copy`: what solutions hold never changes."""
+        return self.__copy__()
 
 
 class ProblemError(CovocpError, ValueError):
@@ -92,6 +100,73 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(message)
         self.solution = solution
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As it was made, in another process too, with what of it can be pickled."""
+        return type(self), self.args, _travelling(self.__dict__)
+
+    def __copy__(self) -> Interrupted:
+        """With what was found, within a process."""
+        made = Interrupted(*self.args)
+        made.__dict__.update(self.__dict__)
+        return made
+
+    def __deepcopy__(self, memo: object) -> Interrupted:
+        """As `copy.copy`: what solutions hold never changes."""
+        return self.__copy__()
+
+
+class NotSent:
+    """What stands on an error that came from another process, in place of something that cannot be pickled.
+
+    It is false, prints as a sentence that says so, and whatever is asked of it raises an error with that sentence.
+
+    Args:
+        name: of the attribute of the error.
+        kind: of what stood there.
+    """
+
+    def __init__(self, name: str, kind: str) -> None:
+        """Keep what it was."""
+        self._name, self._kind = name, kind
+
+    def __repr__(self) -> str:
+        """The sentence."""
+        return (
+            f"<the {self._kind} stayed in the process that raised this error: symbols of CasADi cannot be pickled. "
+            f"To keep it, call error.{self._name}.save(path) there>"
+        )
+
+    def __bool__(self) -> bool:
+        """It is nothing."""
+        return False
+
+    def __getattr__(self, attribute: str) -> Any:
+        """What it had is not here.
+
+        Raises:
+            MissingAttributeError: always; `hasattr` sees that it is not here.
+        """
+        if attribute.startswith("_"):  # asked for by the machinery of Python, while it is made too
+            raise AttributeError(attribute)
+        raise self._missing(MissingAttributeError, f".{attribute}")
+
+    def __getitem__(self, key: object) -> Any:
+        """What it had is not here.
+
+        Raises:
+            ProblemError: always.
+        """
+        raise self._missing(ProblemError, f"[{shown(key, 40)}]")
+
+    def _missing(self, error: type[ProblemError], asked: str) -> ProblemError:
+        return error(
+            f"The {self._kind} of this error stayed in the process that raised it.",
+            expected="numbers, which can be pickled; it is made of symbols and functions of CasADi",
+            received=f".{self._name}{asked} in another process",
+            remedy=f"save it there: except the error, call error.{self._name}.save(path), raise again, and read the "
+            "file by covocp.load(path)",
+        )
+
 
 class ExportError(CovocpError, RuntimeError):
     """Something cannot be exported or written: says what, and why."""
@@ -109,6 +184,21 @@ def remedy_for_symbols(error: BaseException, otherwise: str) -> str:
     if "truth value" in text:
         return "symbols are neither true nor false: take casadi.if_else, casadi.fmin and casadi.fmax, not if, min, max"
     return otherwise
+
+
+def _travelling(kept: Mapping[str, Any]) -> dict[str, Any]:
+    """What an error keeps, by name, as it goes to another process."""
+    import pickle  # here: few errors go to another process
+
+    sent: dict[str, Any] = {}
+    for name, value in kept.items():
+        try:
+            pickle.dumps(value)
+        except Exception:  # whatever classes of others raise: the error that is told must not be lost for it
+            sent[name] = NotSent(name, type(value).__name__.lower())
+        else:
+            sent[name] = value
+    return sent
 
 
 def _remade(kind: type[CovocpError], problem: str, kept: dict[str, Any]) -> CovocpError:

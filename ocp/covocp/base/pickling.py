@@ -1,7 +1,9 @@
-"""What holds symbols and functions of CasADi cannot be pickled, and says so in words that help."""
+"""What is made of symbols and functions of CasADi cannot be pickled, and says so; results are pickled without them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from typing import Any, NoReturn, TypeVar
 
 from covocp.base.errors import ProblemError
@@ -23,6 +25,34 @@ def not_pickled(kind: Kind) -> Kind:
     for name, function in (("__reduce_ex__", _refused), ("__copy__", _itself), ("__deepcopy__", _itself)):
         setattr(kind, name, function)
     return kind
+
+
+def pickled_without(**left: Callable[[], Any]) -> Callable[[Kind], Kind]:
+    """Let the objects of a class, none of which changes, be pickled without some fields; copies are themselves.
+
+    Args:
+        left: by the name of the field what makes that which is in its place in another process, such as `dict` for
+            symbols by name: what is asked for by a name has its answer there too.
+
+    Returns:
+        The decorator of a frozen dataclass; it stands above `@dataclass`.
+    """
+
+    def decorated(kind: Kind) -> Kind:
+        def reduced(self: Any, protocol: object) -> tuple[Any, ...]:
+            kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left}
+            return _restored, (kind, kept, left)
+
+        for name, function in (("__reduce_ex__", reduced), ("__copy__", _itself), ("__deepcopy__", _itself)):
+            setattr(kind, name, function)
+        return kind
+
+    return decorated
+
+
+def _restored(kind: type[Any], kept: Mapping[str, Any], left: Mapping[str, Callable[[], Any]]) -> Any:
+    """An object from what was pickled of it."""
+    return kind(**kept, **{name: make() for name, make in left.items()})
 
 
 def _refused(self: object, protocol: object) -> NoReturn:

@@ -7,11 +7,34 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
 
+from covocp.base.short_repr import short_repr
+
+# The largest violation has fallen where it is less than this share of the least one before; what it is at most, in the
+# units of the method, counts as none.
+FALLEN, MET = 0.9, 1e-6
 # So many iterates one after the other below the floor of the cost that violate less than this have lost their way.
 LOST, NEAR = 10, 1e-2
+
+
+@dataclass(kw_only=True)
+class Course:
+    """How the largest violation went in one run: its last iteration, the least of them, and where it last fell."""
+
+    last: int
+    least: float
+    fell: int
+
+    def goes_on(self, iteration: int, violation: float) -> None:
+        """A further iteration."""
+        self.last = iteration
+        if violation < FALLEN * self.least:
+            self.least, self.fell = violation, iteration
+
+    __repr__ = short_repr
 
 
 class Progress:
@@ -45,6 +68,7 @@ class Progress:
         self._seconds, self._iterations = seconds, iterations
         self._begin, self._seen = time.perf_counter(), 0
         self._title = title
+        self._courses: list[Course] = []
         self._show = show and sys.stderr.isatty()
         self._status: Any = None
         self._previous: Any = None
@@ -129,11 +153,27 @@ class Progress:
     def update(self, iteration: int, cost: float, violation: float) -> None:
         """Report an iteration: its number, its cost, the largest violation of a constraint (scaled)."""
         self._seen += 1
+        self._follow(iteration, violation)
         self._below = self._below + 1 if cost < self._floor and violation < NEAR else 0
         if self._within is not None:
             self._within.update(iteration, cost, violation)
         if self._status is not None:
             self._status.update(f"{self._title}: iteration {iteration}, cost {cost:.8g}, violation {violation:.1e}")
+
+    def _follow(self, iteration: int, violation: float) -> None:
+        """Keep how the violation goes; an iteration that is not after the last one begins another run."""
+        if not self._courses or iteration <= self._courses[-1].last:
+            self._courses.append(Course(last=iteration, least=violation, fell=iteration))
+        else:
+            self._courses[-1].goes_on(iteration, violation)
+
+    def stalled(self, iterations: int) -> int:
+        """For how many iterations the violation had not fallen where the last run of that many iterations ended.
+
+        0 where there was no such run, or where it came to an iterate that violates nothing.
+        """
+        course = next((c for c in reversed(self._courses) if c.last == iterations), None)
+        return 0 if course is None or course.least <= MET else course.last - course.fell
 
     def say(self, what: str) -> None:
         """Report what is being done where nothing is iterated; a Ctrl-C since the last report interrupts here.
@@ -148,5 +188,7 @@ class Progress:
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
+            if callable(self._previous):  # which may note it, where CasADi would lose it
+                self._previous(number, frame)
             raise KeyboardInterrupt
         self.asked = True

@@ -3,7 +3,8 @@
 MUMPS inside Ipopt has static data, CasADi's OpenBLAS waits for ever when several threads call it, and a CasADi function
 that two threads share may write where the other reads. So whatever covocp offers that calls CasADi takes its turn:
 several threads may use the same problem, solver or solution and get the same numbers as one after the other. Processes
-run in parallel. For as long as a turn lasts linear algebra has one thread (`covocp.base.blas`).
+run in parallel. For as long as a turn lasts linear algebra has one thread (`covocp.base.blas`); in one that may be long
+a Ctrl-C that CasADi turns into an error of its own stays a KeyboardInterrupt (`covocp.base.ctrl_c`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any, Generic, ParamSpec, Self, TypeVar, overload
 
 from covocp.base.blas import Limits, one_blas_thread
 from covocp.base.calls import called_as, refused_call
+from covocp.base.ctrl_c import LISTENER
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -70,6 +72,8 @@ class _Turn:
 
 # Special methods that may call CasADi: making, indexing and showing.
 SHOWN = ("__init__", "__getitem__", "__str__", "__repr__", "_repr_html_")
+# Those of them that take no longer than listening to Ctrl-C does.
+BRIEF = ("__getitem__", "__repr__")
 
 TURN = _Turn()
 if hasattr(os, "register_at_fork"):
@@ -80,10 +84,26 @@ def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which waits for its turn; a call that does not fit it is refused by a `ProblemError`."""
 
     @wraps(function)
+    def listening(*args: P.args, **kwargs: P.kwargs) -> R:
+        with LISTENER:
+            return function(*args, **kwargs)
+
+    return _refusing(listening, function)
+
+
+def briefly(function: Callable[P, R]) -> Callable[P, R]:
+    """As `one_at_a_time`, of a function that takes no longer than listening to Ctrl-C does: this is left to others."""
+    return _refusing(function, function)
+
+
+def _refusing(called: Callable[P, R], function: Callable[P, R]) -> Callable[P, R]:
+    """What is called in turn, with the refusal of calls that do not fit the function."""
+
+    @wraps(function)
     def in_turn(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             with TURN:
-                return function(*args, **kwargs)
+                return called(*args, **kwargs)
         except TypeError:
             error = refused_call(function, called_as(function), args, kwargs)
             if error is None:
@@ -99,9 +119,9 @@ def methods_one_at_a_time(cls: C) -> C:
         if name.startswith("_") and name not in SHOWN:
             continue
         if isinstance(value, FunctionType):
-            setattr(cls, name, one_at_a_time(value))
+            setattr(cls, name, briefly(value) if name in BRIEF else one_at_a_time(value))
         elif isinstance(value, property) and value.fget is not None:
-            setattr(cls, name, property(one_at_a_time(value.fget), doc=value.__doc__))
+            setattr(cls, name, property(briefly(value.fget), doc=value.__doc__))
     return cls
 
 
@@ -129,6 +149,7 @@ class cached(Generic[R]):  # noqa: N801 - a decorator, named like functools.cach
         with TURN:
             kept = instance.__dict__
             if self._name not in kept:
-                kept[self._name] = self._function(instance)
+                with LISTENER:
+                    kept[self._name] = self._function(instance)
             value: R = kept[self._name]
         return value

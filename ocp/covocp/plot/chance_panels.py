@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from covocp.plot.curves import Curve, Drawn, Panel
+from covocp.plot.curves import Bound, Curve, Drawn, Panel
 from covocp.solution.chances import widths
 from covocp.solution.solution import Solution
 from covocp.statement.chances import ChanceLimits
@@ -31,7 +31,7 @@ def chance_names(solutions: Sequence[Solution]) -> tuple[str, ...]:
 def chance_panels(drawn: Sequence[Drawn], name: str) -> list[Panel]:
     """A panel for each row of a condition, with its limits; rows differ by name."""
     curves: dict[str, list[Curve]] = {}
-    bounds: dict[str, tuple[float, ...]] = {}
+    bounds: dict[str, dict[Bound, None]] = {}
     for d in drawn:
         for limits in (q for q in on_the_way(d.solution) if q.name == name):
             values, needed = widths(d.solution, limits)
@@ -40,6 +40,7 @@ def chance_panels(drawn: Sequence[Drawn], name: str) -> list[Panel]:
                 sides = there[:, None] * needed[:, i]
                 curve = Curve(t=d.solution.t, y=values[:, i], needed=sides, order=d.order)
                 curves.setdefault(row, []).append(curve)
-                finite = (float(v) for v in (limits.lower[i], limits.upper[i]) if np.isfinite(v))
-                bounds[row] = tuple(dict.fromkeys((*bounds.get(row, ()), *finite)))
-    return [Panel(label=row, entries=(row,), curves=tuple(own), bounds=bounds[row]) for row, own in curves.items()]
+                bounds.setdefault(row, {}).update(dict.fromkeys(d.bounds((limits.lower[i], limits.upper[i]))))
+    return [
+        Panel(label=row, entries=(row,), curves=tuple(own), bounds=tuple(bounds[row])) for row, own in curves.items()
+    ]

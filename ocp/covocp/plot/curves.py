@@ -56,6 +56,18 @@ class Curve:
     __repr__ = short_repr
 
 
+class Bound(NamedTuple):
+    """One bound of a quantity.
+
+    value: of it. order: number of the phase that has it; 0 where solutions do not follow each other. span: along the
+    abscissa; None: all of it.
+    """
+
+    value: float
+    order: int = 0
+    span: tuple[float, float] | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Ellipse:
     """A covariance (2, 2) of abscissa and ordinate about a point (2,) of a path, of the solution of some number."""
@@ -75,7 +87,7 @@ class Panel:
         label: of the ordinate.
         entries: names of its entries; one: all curves are of the same.
         curves: what is drawn.
-        bounds: of the quantity.
+        bounds: of the quantity, those of all solutions.
         legend: whether the entries are explained in it.
         key: name of what it shows where that is one entry of one symbol; "" otherwise.
         path: whether it is one state over another.
@@ -86,7 +98,7 @@ class Panel:
     label: str
     entries: tuple[str, ...]
     curves: tuple[Curve, ...]
-    bounds: tuple[float, ...] = ()
+    bounds: tuple[Bound, ...] = ()
     legend: bool = True
     key: str = ""
     path: bool = False
@@ -128,6 +140,10 @@ class Drawn:
     def known_between(self) -> bool:
         """Whether what is drawn is known between the nodes: not where a loop has other statistics than its design's."""
         return self.solution.loop is None or other_loop(self.solution) is None
+
+    def bounds(self, values: Iterable[float]) -> list[Bound]:
+        """Those of some values that are bounds at all, as bounds of this solution."""
+        return [Bound(float(value), self.order if self.phase else 0) for value in values if np.isfinite(value)]
 
     def knows(self, name: str) -> bool:
         """Whether a name, or the vector of an entry, is in the solution."""

@@ -16,7 +16,7 @@ from covocp.base.arguments import checked, either, optional, positives, sequence
 from covocp.base.errors import ProblemError, no_option
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
-from covocp.plot.curves import Panel, units_in
+from covocp.plot.curves import Bound, Panel, units_in
 from covocp.plot.legends import (
     LONGEST_ABSCISSA,
     axis_label,
@@ -390,7 +390,10 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
             axes.plot(x, y, color=_line(ellipse.order)["color"], linewidth=ELLIPSE_WIDTH, alpha=0.8)
     _targets(axes, panel)
     for bound in _near_bounds(panel):
-        axes.axhline(bound, zorder=1, **BOUND)
+        if bound.span is None:
+            axes.axhline(bound.value, zorder=1, **BOUND)
+        else:
+            axes.plot(bound.span, (bound.value, bound.value), zorder=1, **BOUND)
     axes.set_ylabel(plain_text(_folded(panel.label)))
     axes.margins(x=PATH_MARGIN if panel.path else 0)
     if panel.equal:
@@ -412,7 +415,7 @@ def _targets(axes: Axes, panel: Panel) -> None:
             axes.plot([curve.t[-1]], [curve.target], linestyle="none", clip_on=False, zorder=5, **TARGET)
 
 
-def _near_bounds(panel: Panel) -> list[float]:
+def _near_bounds(panel: Panel) -> list[Bound]:
     """The bounds that the curves come near."""
     reached = [curve.y for curve in panel.curves]
     for curve in panel.curves:
@@ -422,7 +425,7 @@ def _near_bounds(panel: Panel) -> list[float]:
         return []
     low, high = float(finite.min()), float(finite.max())
     margin = NEAR * (high - low)
-    return [bound for bound in panel.bounds if low - margin <= bound <= high + margin]
+    return [bound for bound in panel.bounds if low - margin <= bound.value <= high + margin]
 
 
 def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:

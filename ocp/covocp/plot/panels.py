@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,13 +15,13 @@ from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
 from covocp.plot.attitude_panels import attitude_panels
 from covocp.plot.chance_panels import CHANCE, chance_names, chance_panels
-from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
+from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Bound, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
 from covocp.solution.solution import Solution
 from covocp.statement.entries import entry_names
 from covocp.statement.names import block_of, chosen_entry, name_of, sizes_of, split_entry
-from covocp.statement.statement import Block, Statement
+from covocp.statement.statement import Block
 from covocp.statement.time_data import in_words
 
 # Matrices up to this size are shown whole, larger ones by their diagonal.
@@ -375,22 +375,23 @@ def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
             )
             for i in range(own.size)
         ]
-    owner = next((d.solution for d in drawn if d.knows(block.name)), None)
-    bounds = _bounds(None, block) if owner is None else _bounds(owner.statement, owner.block(block.name))
+    bounds = [_bounds(d, block) for d in drawn if d.knows(block.name)]
     suffix = " (estimate)" if block.kind == "unknown" else ""
     return _separated(block, suffix + unit_of(block.name, units), curves, bounds)
 
 
-def _bounds(statement: Statement | None, block: Block) -> Array:
-    """Lower and upper bounds of a state or a control, (2, size); infinite where there are none."""
-    if statement is None or block.kind not in ("state", "control"):
-        return np.tile([[-np.inf], [np.inf]], (1, block.size))
-    bounds = statement.state_bounds if block.kind == "state" else statement.control_bounds
-    return np.array([bound[block.span] for bound in bounds])
+def _bounds(drawn: Drawn, block: Block) -> list[list[Bound]]:
+    """Bounds of the entries of a state or a control that a solution has; of others none."""
+    statement, own = drawn.solution.statement, drawn.solution.block(block.name)
+    if statement is None or own.kind not in ("state", "control"):
+        return [[] for _ in range(own.size)]
+    bounds = statement.state_bounds if own.kind == "state" else statement.control_bounds
+    lower, upper = (bound[own.span] for bound in bounds)
+    return [drawn.bounds(pair) for pair in zip(lower, upper, strict=True)]
 
 
-def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Array) -> list[Panel]:
-    """A panel an entry, or one for many of them (then without bands)."""
+def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Sequence[list[list[Bound]]] = ()) -> list[Panel]:
+    """A panel an entry, with the bounds of each solution, or one for many of them (then without both and bands)."""
     entries = entry_names((block,))
     if len(entries) > SEPARATE_ENTRIES:
         plain = tuple(replace(curve, deviation=None) for curve in curves)
@@ -401,7 +402,7 @@ def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Array) ->
             entries=(entry,),
             key=entry,
             curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
-            bounds=tuple(float(b) for b in bounds[:, i] if np.isfinite(b)),
+            bounds=tuple(dict.fromkeys(bound for own in bounds for bound in own[i])),
         )
         for i, entry in enumerate(entries)
     ]
@@ -480,7 +481,7 @@ def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
             for d in chosen
             for i, values in enumerate(d.solution.costate(block.name).reshape(d.solution.t.size, -1).T)
         ]
-        panels = _separated(block, "", curves, _bounds(None, block))
+        panels = _separated(block, "", curves)
         return [replace(panel, label=f"costate of {panel.label}", key="") for panel in panels]
     pairs = [pair for group in _pairs(block) for pair in group]
     entries = tuple(f"{block.labels[i]}, {block.labels[j]}" for i, j in pairs)

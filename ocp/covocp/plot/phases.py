@@ -13,7 +13,7 @@ from covocp.base.arguments import checked, optional, positives, text, texts_by_n
 from covocp.base.expressions import Given
 from covocp.base.files import check_target
 from covocp.base.matrices import Array
-from covocp.plot.curves import Panel, units_in
+from covocp.plot.curves import Bound, Curve, Panel, units_in
 from covocp.plot.figure import SUFFIXES, drawn_figure
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.solution.instants import instant_times
@@ -87,9 +87,17 @@ def _marks(solution: PhasesSolution) -> tuple[float, ...]:
 
 
 def _joined(panel: Panel, shifts: Array) -> Panel:
-    """A panel of the phases as one of the whole time."""
+    """A panel of the phases as one of the whole time, each bound along the phase that has it."""
+    moved = [replace(curve, t=curve.t + shifts[curve.order]) for curve in panel.curves]
     return replace(
         panel,
-        curves=tuple(replace(curve, t=curve.t + shifts[curve.order], order=0) for curve in panel.curves),
+        curves=tuple(replace(curve, order=0) for curve in moved),
+        bounds=tuple(_along(bound, moved) for bound in panel.bounds),
         ellipses=tuple(replace(ellipse, order=0) for ellipse in panel.ellipses),
     )
+
+
+def _along(bound: Bound, curves: list[Curve]) -> Bound:
+    """A bound as far as the curves of its phase go."""
+    own = np.concatenate([curve.t for curve in curves if curve.order == bound.order])
+    return bound._replace(span=(float(np.nanmin(own)), float(np.nanmax(own))))

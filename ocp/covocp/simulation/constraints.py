@@ -20,6 +20,7 @@ from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
+from covocp.base.pickling import pickled_without
 from covocp.base.residuals import PASSED
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
@@ -72,6 +73,7 @@ class Row:
         return int(at[-1 if self.late else 0]) if at.size else None
 
 
+@pickled_without(function=ca.Function)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rows:
     """The inequalities that runs can violate, in their order: of the path, the start, the end, the instants.

@@ -16,6 +16,7 @@ from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.pages import as_html
+from covocp.base.pickling import pickled_without
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.chances import Share, chance_shares
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 
 @methods_one_at_a_time
+@pickled_without(symbols=dict)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MonteCarlo:
     """Simulated runs of an actual system with its filter and feedback.
@@ -86,7 +88,7 @@ class MonteCarlo:
         paths: deviation, estimate and deviation of the control of the first runs, (runs, K, 2n + m).
         failed: runs that were not simulated because their task failed.
         interrupted: whether it was stopped before the last run.
-        blocks: where each symbol lies; symbols: by name.
+        blocks: where each symbol lies; symbols: by name, none where it was pickled: names mean the same.
         augmented: names of the rows.
     """
 

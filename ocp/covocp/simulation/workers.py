@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
+from covocp.base.ctrl_c import LISTENER
 from covocp.base.errors import ProblemError
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import TURN
@@ -108,6 +109,7 @@ def _here(
             else:
                 report(done[-1])
     except (StoppedError, KeyboardInterrupt):
+        LISTENER.caught()
         return Harvest(batches=tuple(done), failures=(), interrupted=True)
     return Harvest(batches=tuple(done), failures=tuple(failures), interrupted=False)
 
@@ -146,6 +148,7 @@ def _elsewhere(
                 report(done[first])
             interrupted = interrupted or stop()
     except KeyboardInterrupt:
+        LISTENER.caught()
         interrupted = True
     if interrupted:
         for future in tasks:

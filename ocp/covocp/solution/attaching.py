@@ -24,6 +24,7 @@ from covocp.statement.statement import Block, Statement
 SAME_RATES = 1e-6
 # The same of what is read at an instant; well above what a solver leaves of the equations of a program.
 SAME_READING = 1e-4
+MOVABLE = "initial_"  # what the names of parameters begin with that are initial values
 LISTED = 4  # differences that an error lists
 PLURAL = tuple(
     f"the {what}"
@@ -63,13 +64,19 @@ def _of_another(solution: Solution, statement: Statement, found: list[Difference
     more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
     names = ", ".join(entry.what for entry in shown)
     plural = len(found) > 1 or names.startswith(PLURAL)
+    elsewhere = any(b.kind == "parameter" and b.name.startswith(MOVABLE) for b in solution.blocks)
+    own = "what Solver.solve() found from elsewhere is loaded with movable(problem)"
+    own += (
+        f", of the problem stated with a duration of {solution.duration:.12g} s; " if "the duration" in names else "; "
+    )
+    own = own if elsewhere and any(entry.what in ("the duration", "the symbols") for entry in found) else ""
     called = f" (stored: '{solution.name}', given: '{statement.name}')" if solution.name != statement.name else ""
     return ProblemError(
         f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
         expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
         received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
-        remedy="give the problem that was solved, or load without one; evaluate(problem, nominal=load(path)) tells "
-        "what the stored nominal means for another problem",
+        remedy=f"give the problem that was solved, or load without one; {own}evaluate(problem, nominal=load(path)) "
+        "tells what the stored nominal means for another problem",
     )
 
 

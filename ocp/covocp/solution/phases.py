@@ -17,7 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
 from covocp.solution.known_links import KnownLink, check_links
-from covocp.solution.report import refinement, sections, starts_told, stated_first
+from covocp.solution.report import refinement, sections, starts_told, stated_first, without_problem
 from covocp.solution.sample import Sample, asked_times
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
@@ -263,7 +263,8 @@ class PhasesSolution:
             effort.append(Sentence(starts_told(self.stats["starts"])))
         violated = [[name, number(value, 4)] for name, value in stated_first(self.violations)]
         limits: Section = [Table(columns=["violated constraint", "by"], rows=violated)] if violated else []
-        return [head, limits, table, effort, links, *(section for phase in self.phases for section in sections(phase))]
+        phases = [section for phase in self.phases for section in sections(phase)]
+        return [head, limits, table, without_problem(self.phases[0]), effort, links, *phases]
 
     def __repr__(self) -> str:
         """One line."""

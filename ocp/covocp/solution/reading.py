@@ -9,6 +9,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
+from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.spread_limits import scattered
 from covocp.solution.origin import Origin
@@ -60,6 +61,7 @@ def by_name(solution: Solution, t: Array, x: Array, u: Array, e: Array) -> dict[
     return result | {entry.name: entry.at(t) for entry in _data(solution)}
 
 
+@one_at_a_time
 def expression_values(solution: Solution, expression: ca.MX) -> Array:
     """Values of an expression of the problem's symbols, (K,) or (K, rows, columns) without axes of one entry.
 
@@ -80,6 +82,7 @@ def expression_values(solution: Solution, expression: ca.MX) -> Array:
     return _shaped(value, expression, count)
 
 
+@one_at_a_time
 def expression_between(solution: Solution, expression: ca.MX, t: Array, *, before: bool = False) -> Array:
     """Values of an expression at some times [s], (K,) or (K, rows, columns); where something jumps after it, or before.
 

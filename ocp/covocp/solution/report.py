@@ -80,6 +80,7 @@ def sections(solution: Solution) -> list[Section]:
         *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix" and shown(block)),
         residual_section(solution),
         _between_nodes(solution),
+        without_problem(solution) if solution.within is None else [],
         _effort(solution),
     ]
 
@@ -367,6 +368,17 @@ def _between_nodes(solution: Solution) -> Section:
         f"limits are imposed at {where}; {'there' if worst.imposed else 'between them'} that of '{worst.name}' is "
         f"passed by up to {worst.by:.2g}, {100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: {less} it less, "
         "check_path() lists all"
+    )
+    return [Sentence(text)]
+
+
+def without_problem(solution: Solution) -> Section:
+    """What is not told of a solution that was read without its problem, a sentence; empty where that is known."""
+    if solution.statement is not None:
+        return []
+    text = (
+        "read without its problem: limits passed between the nodes, conditions at instants and the room that feedback "
+        "leaves to bounds are not shown; covocp.load(path, problem) knows them"
     )
     return [Sentence(text)]
 

@@ -12,9 +12,11 @@ from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.pickling import pickled_without
 from covocp.statement.names import entry_values, name_of
 
 
+@pickled_without(symbols=dict)
 @dataclass(frozen=True, kw_only=True)
 class Sample:
     """Values at some times, indexed like a solution (time first where several times were asked for)."""

@@ -34,7 +34,9 @@ KEPT = 4
 def movable(problem: Problem) -> Problem:
     """The same problem with its start as parameters, "initial_<name>": what `Solver.solve(initial=)` solves.
 
-    Files of such solutions are loaded with it. A start that depends on other parameters has its declared value here.
+    Files of such solutions are loaded with it; the duration is no parameter: what was solved with `duration=` is loaded
+    with that of the problem stated with that duration. A start that depends on other parameters has its declared value
+    here.
 
     Args:
         problem: whose known initial values of states and matrices become parameters.

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from covocp.base.errors import SolveError
+from covocp.base.progress import Progress
 from covocp.extremal.densities import impossible_density, impossible_in_phases
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import missed
+from covocp.extremal.links import ChainOutcome
 from covocp.extremal.open_loop import matrices_along_controls
 from covocp.solution.report import stated_first
 from covocp.solution.solution import Solution
 from covocp.solving.decisions import bent_cost, bent_data, far_away
+from covocp.transcription.halved_steps import refined_run
 
+# A violation that has not fallen for so many iterations, which are this share of the run, is not on its way to zero.
+MANY, MOST = 100, 0.5
 # Violations that are named.
 NAMED = 10
 # How rows begin that keep a state or matrix in one piece.
 GAP = "continuity of "
+CONTRADICT = "the constraints may contradict"
+
+AnyOutcome = TypeVar("AnyOutcome", Outcome, ChainOutcome)
 
 
 def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_way: str) -> SolveError:
@@ -32,7 +41,7 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         solution: the last iterate.
         other_way: a line about another method; empty: none.
     """
-    along = _passed_along(outcome)
+    along = _passed_along(outcome) | _passed_by_integrals(outcome)
     violations = along | {row: max(value, along.get(row, 0.0)) for row, value in outcome.violations.items()}
     lines = [f"  {row}: {value:.6g}" for row, value in stated_first(violations)[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
@@ -62,6 +71,43 @@ def _passed_along(outcome: Outcome) -> dict[str, float]:
         return missed(given) if np.isfinite(along).all() else {}
     except (RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):  # an iterate without values
         return {}
+
+
+def _passed_by_integrals(outcome: Outcome) -> dict[str, float]:
+    """Limits that integrals pass along the last iterate, where what they pass is spread over their gaps.
+
+    An integral is one whole: all gaps together are what an iterate has left out of it. A run whose limits contradict
+    has its share of that at each node, and meets the limit.
+    """
+    extremal, st = outcome.extremal, outcome.extremal.statement
+    entries = [k for b in st.states if b.role == "integral" for k in range(b.span.start, b.span.stop)]
+    gaps = [k for k in entries if GAP + st.state_names[k] in outcome.violations]
+    if not gaps:
+        return {}
+    try:
+        jumps = refined_run(st, extremal.mesh, extremal.trajectory, extremal.parameters, parts=1).jumps[:, gaps]
+        left_out = np.cumsum(jumps, axis=0)
+        x, begins = extremal.trajectory.x.copy(), np.array(extremal.mesh.starts[:-1])
+        before = np.searchsorted(begins, np.arange(len(x)), side="right") - 1
+        before[-1] = len(begins)
+        x[:, gaps] += np.vstack([np.zeros(len(gaps)), left_out])[before]
+        if not np.isfinite(x).all():
+            return {}
+        given = replace(extremal, trajectory=replace(extremal.trajectory, x=x))
+        believed, found = missed(extremal), missed(given)
+    except (RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):  # an iterate without values
+        return {}
+    return {name: value for name, value in found.items() if value > believed.get(name, 0.0)}
+
+
+def with_stalled(outcome: AnyOutcome, reporter: Progress) -> AnyOutcome:
+    """An outcome that did not converge, whose message tells where its violation has long not fallen any more."""
+    iterations = int(outcome.stats.get("iterations", -1))
+    stalled = 0 if outcome.converged else reporter.stalled(iterations)
+    if stalled < max(MANY, MOST * iterations) or CONTRADICT in outcome.message or not outcome.violations:
+        return outcome
+    told = f"but in the last {stalled} of {iterations} iterations the violation has not fallen: {CONTRADICT}"
+    return replace(outcome, message=f"{outcome.message}; {told}")
 
 
 def possible(outcome: Outcome) -> tuple[Outcome, bool]:

@@ -21,7 +21,7 @@ from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import stated_first
 from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
-from covocp.solving.failure import impossible_noises
+from covocp.solving.failure import impossible_noises, with_stalled
 from covocp.solving.methods import METHODS, mesh_options, method_options
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
 from covocp.solving.phases_given import intervals_of, of_each, values_of
@@ -90,7 +90,7 @@ def solve_phases(
         starts = [list(near), list(best)] if near is not best else [list(best)]
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         outcome = ChainRuns(chain, method, prepare, own, reporter, values, starts).solve(asked, random)
-        outcome = _if_possible(chain, outcome)
+        outcome = with_stalled(_if_possible(chain, outcome), reporter)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
             raise interrupted(solution)

@@ -36,7 +36,7 @@ from covocp.solving.continued import again_on, continued
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
-from covocp.solving.failure import failure, possible
+from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
@@ -262,6 +262,7 @@ class Solver:
             if reporter.spent and not outcome.converged:
                 outcome = replace(outcome, message=f"stopped at {reporter.spent}")
                 return self._timed(self._finish(outcome, first, allow_failure=True, assess=assess), begin)
+            outcome = with_stalled(outcome, reporter)
             solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 

@@ -8,9 +8,11 @@ from typing import Literal
 import casadi as ca
 
 from covocp.base.matrices import Array
+from covocp.base.pickling import pickled_without
 from covocp.base.short_repr import short_repr
 
 
+@pickled_without(function=ca.Function)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChanceLimits:
     """lower <= value <= upper of the actual system with a probability, by the linearised spread of the value.

@@ -225,7 +225,8 @@ def unknown_name(
         return ProblemError(
             f"'{foreign}' is not in this solution: it is a symbol of another problem, and has the same name."
             if known
-            else f"'{foreign}' is a symbol, and only names are known here: of several phases, or read from a file.",
+            else f"'{foreign}' is a symbol, and only names are known here: of several phases, or read from a file, or "
+            "sent to another process.",
             expected=expected if known else expected.replace("symbol or name", "name", 1),
             received=str(key)[:100],
             remedy=("take the symbol of the problem that was solved, or " if known else "give ")
