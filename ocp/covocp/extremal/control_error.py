@@ -29,7 +29,7 @@ SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 # s^2 - s + 1/6 (linear) or s - 1/2 (constant) in each interval.
 HAT, STEP = (1.0 / 3.0, 64.0 / 15.0), (1.0 / 4.0, 4.0 / 3.0)
 # Share of its range within which a control counts as at a bound.
-AT_BOUND = 1e-3
+AT_BOUND = 1e-2
 # Parts of an interval whose ends a polynomial goes through, and its values in the middles of many equal parts.
 PARTS, MANY = 4, 64
 SAMPLES = np.vander((np.arange(MANY) + 0.5) / MANY, PARTS + 1) @ np.linalg.inv(
@@ -116,7 +116,7 @@ class _Along:
 def _convex(curvatures: Iterable[Array]) -> Mask:
     """Controls of each interval in which H is strictly convex, all of them together, at all places, (N, nu)."""
     bends = np.array(list(curvatures))
-    found = (np.diagonal(bends, axis1=2, axis2=3) > 0).all(axis=0)
+    found: Mask = np.all(np.diagonal(bends, axis1=2, axis2=3) > 0, axis=0)
     block = np.where(found[:, :, None] & found[:, None, :], bends, np.eye(bends.shape[-1]))
     return np.asarray(found & (np.linalg.eigvalsh(block)[..., :1] > 0).all(axis=0))
 

@@ -69,10 +69,12 @@ class Optimality:
         mesh_error: relative change of the cost by halving the integration steps.
         node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
             relative to its range.
-        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; where a
-            condition along the path or the bound of a state acts, the change by a finer mesh, with what limits that are
-            missed between the nodes are worth; nan where that was not to be had. None where implicit steps pass a
-            nominal so stiff that H is not known pointwise, and H_uu is not positive.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; of
+            controls in which H is not convex, int of what H is above its least value with the controls beside (nan of
+            one constant control without bounds); where a condition along the path or the bound of a state acts, the
+            change by a finer mesh, with what limits that are missed between the nodes are worth; nan where that was
+            not to be had. None where implicit steps pass a nominal so stiff that H is not known pointwise, and H_uu is
+            not positive.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be

@@ -125,7 +125,8 @@ def _not_known(solution: Solution) -> str:
     if solution.statement is not None:
         shares = acting(solution.extremal)
         if not shares:
-            return ""
+            alone = solution.trajectory.u.shape[0] == 1
+            return "NOT KNOWN, with one control value to compare: more intervals" if alone else ""
         where = max(shares, key=lambda name: shares[name])
         reason = f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
     return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="
