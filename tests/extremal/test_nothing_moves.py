@@ -47,3 +47,19 @@ def test_a_nominal_that_rests_is_solved_between_its_nodes_too() -> None:
     assert np.abs(sample["x"]).max() < 1e-12
     assert np.linalg.eigvalsh(sample["E"]).min() > 0
     assert abs(co.worth(at_rest()).gain) < 1e-4
+
+
+@pytest.mark.parametrize("at", ["path", "final"])
+def test_a_cost_that_vanishes_beside_a_limit_has_no_share_that_is_wrong(at: str) -> None:
+    """Multipliers of 1e-20 that the solver leaves beside a limit move controls: two thirds of 1e-34 were told as off."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.5)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(E[x, x], upper=10.0, at=at)
+    ocp.minimize(running=x**2 + u**2)
+    solution = co.solve(ocp, intervals=20, progress=False)
+    assert solution.optimality.control_error == 0.0
+    assert solution.optimality.stationarity == 0.0
+    assert "LARGE" not in str(solution)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked
-from covocp.extremal.cost_sizes import absolute_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined, with_parts
@@ -37,7 +36,7 @@ SAMPLES = np.vander((np.arange(MANY) + 0.5) / MANY, PARTS + 1) @ np.linalg.inv(
 )
 
 
-def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], others: float) -> float | None:
+def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: float) -> float | None:
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
@@ -50,7 +49,7 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], others:
     Args:
         extremal: the solution.
         kinds: of the controls in each interval, (N, nu): free in all of it; at a bound somewhere. Others do not count.
-        others: size of the cost of the rest of a chain.
+        size: of the cost, in which it is measured.
 
     Returns:
         The share of the cost; None where H is not known pointwise, and needed; nan where there is one control alone,
@@ -69,7 +68,7 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], others:
         left = (kinds[0] | kinds[1]) & ~convex
         if left.any():
             total += _above(extremal, left, around)
-    return None if total is None else float(total / max(absolute_cost(extremal) + others, np.finfo(float).tiny))
+    return None if total is None else float(total / max(size, np.finfo(float).tiny))
 
 
 @dataclass(frozen=True, kw_only=True)
