@@ -51,7 +51,7 @@ def test_a_nominal_that_rests_is_solved_between_its_nodes_too() -> None:
 
 @pytest.mark.parametrize("at", ["path", "final"])
 def test_a_cost_that_vanishes_beside_a_limit_has_no_share_that_is_wrong(at: str) -> None:
-    """Multipliers of 1e-20 that the solver leaves beside a limit move controls: two thirds of 1e-34 were told as off."""
+    """Multipliers of 1e-20 that are left beside a limit move controls: two thirds of 1e-34 were told as off."""
     ocp = co.Problem(2.0)
     x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u")
     ocp.dynamics(x, -x + u, noise=0.1)
