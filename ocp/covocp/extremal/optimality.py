@@ -80,8 +80,8 @@ class Optimality:
             not positive.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
-            to its largest; 0 where its sign is below its error, or where what a negative one leads to, until bounds of
-            the controls stop it, is less than the mesh leaves or 1e-5 of the cost; None where nothing is left to move,
+            to its largest; 0 where its sign is below its error, or where what a negative one is worth between the
+            bounds of the controls is less than the mesh leaves or 1e-5 of the cost; None where nothing is left to move,
             or it cannot be had; nan where it would take too long. Negative: the solution is a saddle.
         decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
             multipliers of its bounds; relative to the sum of the absolute terms or, where that is less, to a tenth of
@@ -219,7 +219,7 @@ def complementarity(extremal: Extremal, others: float = 0.0) -> float:
         extremal: the solution.
         others: size of the cost of the rest of a chain.
     """
-    return duality_gap(extremal) / max(absolute_cost(extremal) + others, NO_COST)
+    return duality_gap(extremal) / max(absolute_cost(refined(extremal)) + others, NO_COST)
 
 
 def duality_gap(extremal: Extremal) -> float:
