@@ -133,7 +133,7 @@ def _around(extremal: Extremal) -> Array:
     """
     u, constant = extremal.controls, extremal.mesh.control == "constant"
     first, last = u[:-1], u[:-1] if constant else u[1:]
-    places = np.flatnonzero(np.diff(extremal.time) > 0)  # what is read at an instant has an interval of no length
+    places = np.flatnonzero(np.diff(extremal.mesh.nodes) > 0)  # what is read at an instant has an interval of no length
     lower, upper = extremal.statement.control_bounds
     if constant and places.size < 2:
         return np.array([np.where(np.isfinite(bound), bound, np.nan) + 0.0 * first for bound in (lower, upper)])
