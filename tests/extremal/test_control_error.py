@@ -108,3 +108,90 @@ def test_singular_controls_behind_implicit_steps_have_no_estimate():
     assert solution.mesh.step == "rodas"
     assert solution.optimality.control_error is None
     assert "piecewise form" not in str(solution)
+
+
+def with_a_valve() -> tuple[co.Problem, float]:
+    """Layers of 1/30 s at both ends, sqrt(e) tanh(1/(2 sqrt(e))), beside a valve that lets 0.5 pass at any time."""
+    weight = 1e-3
+    ocp = co.Problem(1.0)
+    x, y = ocp.state("x", initial=1.0, final=1.0), ocp.state("y", initial=0.0, final=0.5)
+    u, w = ocp.control("u"), ocp.control("w", lower=0.0, upper=1.0)
+    ocp.dynamics(x, u)
+    ocp.dynamics(y, w)
+    ocp.minimize(running=0.5 * x**2 + 0.5 * weight * u**2 + 0.01 * w)
+    return ocp, float(np.sqrt(weight) * np.tanh(0.5 / np.sqrt(weight))) + 0.005
+
+
+def least_time() -> tuple[co.Problem, float]:
+    """From rest to rest over 1 by a force between -2 and 1."""
+    ocp = co.Problem(co.Free(2.0, 0.1, 10.0))
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u", lower=-2.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(terminal=ocp.duration)
+    return ocp, float(np.sqrt(3.0))
+
+
+def least_fuel() -> tuple[co.Problem, float]:
+    """Two thrusters, each on for t with t (3 - t) = 1."""
+    ocp = co.Problem(3.0)
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    ahead, back = ocp.control("ahead", lower=0.0, upper=1.0), ocp.control("back", lower=0.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, ahead - back)
+    ocp.minimize(running=ahead + back)
+    return ocp, 3.0 - float(np.sqrt(5.0))
+
+
+def singular_arc() -> tuple[co.Problem, float]:
+    """Bang, then u = x along x + v = 0; its optimum as published."""
+    ocp = co.Problem(5.0)
+    x, v = ocp.state("x", initial=0.0), ocp.state("v", initial=1.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=x**2 + v**2)
+    return ocp, 0.7539839
+
+
+def short_pulse() -> tuple[co.Problem, float]:
+    """H_u = t - 0.03: the best control is at its upper bound for 0.03 s, which no node sees."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=(ocp.time - 0.03) * u)
+    return ocp, -0.5 * (0.03**2 + 0.97**2)
+
+
+@pytest.mark.parametrize("control", ["constant", "linear"])
+@pytest.mark.parametrize(
+    ("problem", "intervals", "most"),
+    [
+        (with_a_valve, 13, 1.1),
+        (with_a_valve, 20, 1.1),
+        (least_time, 10, 2.0),
+        (least_time, 25, 2.0),
+        (least_fuel, 20, 3.0),
+        (singular_arc, 20, 4.0),
+        (short_pulse, 10, 1.1),
+    ],
+)
+def test_controls_in_which_h_is_linear_count(problem, intervals, most, control):
+    """Beside them others did not count at all, nor did they where they were constant: 0 was told of 31 %."""
+    ocp, optimum = problem()
+    solution = co.solve(ocp, intervals=intervals, control=control, substeps=8, progress=False)
+    excess = (solution.cost - optimum) / abs(optimum)
+    assert 0.7 * excess < solution.optimality.control_error < most * excess
+
+
+def test_the_error_of_one_control_value_is_not_known():
+    ocp = co.Problem(1.0)
+    x, y = ocp.state("x", initial=1.0), ocp.state("y", initial=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.dynamics(y, x)
+    ocp.minimize(running=x**2, terminal=y**2)
+    solution = co.solve(ocp, intervals=1, control="constant", progress=False)
+    assert np.isnan(solution.optimality.control_error)
+    assert "NOT KNOWN, with one control value" in str(solution)

@@ -47,3 +47,32 @@ def test_a_nominal_that_rests_is_solved_between_its_nodes_too() -> None:
     assert np.abs(sample["x"]).max() < 1e-12
     assert np.linalg.eigvalsh(sample["E"]).min() > 0
     assert abs(co.worth(at_rest()).gain) < 1e-4
+
+
+@pytest.mark.parametrize("at", ["path", "final"])
+def test_a_cost_that_vanishes_beside_a_limit_has_no_share_that_is_wrong(at: str) -> None:
+    """Multipliers of 1e-20 that are left beside a limit move controls: two thirds of 1e-34 were told as off."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.5)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(E[x, x], upper=10.0, at=at)
+    ocp.minimize(running=x**2 + u**2)
+    solution = co.solve(ocp, intervals=20, progress=False)
+    assert solution.optimality.control_error == 0.0
+    assert solution.optimality.stationarity == 0.0
+    assert "LARGE" not in str(solution)
+
+
+def test_a_cost_that_is_the_difference_of_two_is_measured_in_these() -> None:
+    """Aly and Chan: x = sin(t) makes both integrals pi/8; 140 times what is left was told for an error of 4e-10."""
+    ocp = co.Problem(0.5 * np.pi)
+    x, v = ocp.state("x", initial=0.0), ocp.state("v", initial=1.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=0.5 * (v**2 - x**2))
+    solution = co.solve(ocp, intervals=100, progress=False)  # without a warning of a coarse mesh
+    assert abs(solution.cost) < 1e-8
+    assert solution.mesh_error < 1e-5

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked
-from covocp.extremal.cost_sizes import absolute_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
-from covocp.extremal.fine_mesh import halved, refined
+from covocp.extremal.fine_mesh import refined, with_parts
 from covocp.extremal.hamiltonian import by_controls
 from covocp.statement.interval import repeated
 
@@ -27,92 +27,170 @@ SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 # up and down; by how much more the cost falls with the best control, whose difference from the form is taken for
 # s^2 - s + 1/6 (linear) or s - 1/2 (constant) in each interval.
 HAT, STEP = (1.0 / 3.0, 64.0 / 15.0), (1.0 / 4.0, 4.0 / 3.0)
+# Share of its range within which a control counts as at a bound.
+AT_BOUND = 1e-2
+# Parts of an interval whose ends a polynomial goes through, and its values in the middles of many equal parts.
+PARTS, MANY = 4, 64
+SAMPLES = np.vander((np.arange(MANY) + 0.5) / MANY, PARTS + 1) @ np.linalg.inv(
+    np.vander(np.arange(PARTS + 1) / PARTS, PARTS + 1)
+)
 
 
-def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], others: float) -> float | None:
+def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: float) -> float | None:
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
     somewhere in it count with what the Hamiltonian, quadratic in each of them, can fall between the bounds, by
-    Simpson's rule. Intervals in which H_uu is not positive definite count with what the Hamiltonian is above its value
-    with the control of one of their ends, by the same rule.
+    Simpson's rule. Controls in which H is not convex over an interval, as where it is linear in them, count with what
+    it is above its values with the controls before, in and after it (`_above`).
 
     All costates are those of the discrete steps: fast ones are no polynomial over an interval.
 
     Args:
         extremal: the solution.
         kinds: of the controls in each interval, (N, nu): free in all of it; at a bound somewhere. Others do not count.
-        others: size of the cost of the rest of a chain.
+        size: of the cost, in which it is measured.
 
     Returns:
-        The share of the cost; None where H is not known pointwise, and needed.
+        The share of the cost; None where H is not known pointwise, and needed; nan where there is one control alone,
+        with no other to compare it with.
     """
-    points = extremal.mesh.points
+    points, around = extremal.mesh.points, _around(extremal)
     if points > 1:  # costates jump inside the intervals
         extremal, kinds = refined(extremal), (np.repeat(kinds[0], points, axis=0), np.repeat(kinds[1], points, axis=0))
-    fine = halved(extremal)
-    values = _along(extremal, fine)
-    total = (_by_middles if extremal.mesh.step == "rodas" else _by_points)(extremal, fine, values, kinds)
-    return None if total is None else float(total / max(absolute_cost(extremal) + others, np.finfo(float).tiny))
+        around = np.repeat(around, points, axis=1)
+    along = _Along.of(extremal, 2)
+    convex = _convex(along.at(j)[2] for j in range(3))
+    if extremal.mesh.step == "rodas":
+        total = _by_middles(extremal, along, convex, kinds)
+    else:
+        total = _by_points(extremal, along, convex, kinds)
+        left = (kinds[0] | kinds[1]) & ~convex
+        if left.any():
+            total += _above(extremal, left, around)
+    return None if total is None else float(total / max(size, np.finfo(float).tiny))
 
 
-class _Values(NamedTuple):
-    """At start, middle and end of each interval: controls, H_u (3, N, nu), H_uu (3, N, nu, nu), fall of H (3, N).
+@dataclass(frozen=True, kw_only=True)
+class _Along:
+    """The Hamiltonian at the places of each interval that end equal parts of it.
 
-    definite: intervals in which H_uu is positive definite, (N,).
-    above: by how much H is above its value with the control of one of the ends of the interval; zero where H_uu is
-        positive definite in all of them.
+    Attributes:
+        fine: the extremal with these places as nodes.
+        parts: of each interval.
+        ends: controls at both ends of each interval (2, N, nu).
+        function: (x, u, e, t, T, p, costates) of all intervals -> H, H_u, H_uu.
     """
 
-    u: Array
-    slopes: Array
-    curvatures: Array
-    definite: Mask
-    above: Array
+    fine: Extremal
+    parts: int
+    ends: tuple[Array, Array]
+    function: Matrices
+
+    @staticmethod
+    def of(extremal: Extremal, parts: int) -> _Along:
+        """Of an extremal whose limits are imposed at its nodes."""
+        u, n = extremal.controls, extremal.mesh.intervals
+        return _Along(
+            fine=with_parts(extremal, parts),
+            parts=parts,
+            ends=(u[:-1], u[:-1] if extremal.mesh.control == "constant" else u[1:]),
+            function=Matrices(by_controls(extremal.statement).map(n)),
+        )
+
+    def control(self, j: int) -> Array:
+        """The control there, (N, nu)."""
+        return self.ends[0] + j / self.parts * (self.ends[1] - self.ends[0])
+
+    def at(self, j: int, control: Array | None = None) -> list[Array]:
+        """H (N, 1, 1), H_u (N, nu, 1) and H_uu (N, nu, nu) at place j, with another control where one is given."""
+        fine, n = self.fine, self.ends[0].shape[0]
+        costates, t = discrete_costates(fine)[0], fine.trajectory
+        at = slice(j, j + self.parts * (n - 1) + 1, self.parts)
+        known = (*repeated(t.duration, fine.parameters, n), costates.state[at].T, costates.matrices[at].T)
+        u = self.control(j) if control is None else control
+        return [stacked(v, n) for v in self.function.evaluated(t.x[at].T, u.T, t.e[at].T, fine.time[None, at], *known)]
 
 
-def _along(extremal: Extremal, fine: Extremal) -> _Values:
-    """The Hamiltonian at both ends and in the middle of each interval; `fine`: with the middles as nodes."""
-    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
-    costates, t = discrete_costates(fine)[0], fine.trajectory
-    u, h = extremal.controls, np.diff(extremal.time)
-    ends = u[:-1] if mesh.control == "constant" else u[1:]
-    function = Matrices(by_controls(st).map(n))
-    controls = [u[:-1] + j / 2 * (ends - u[:-1]) for j in range(3)]
+def _convex(curvatures: Iterable[Array]) -> Mask:
+    """Controls of each interval in which H is strictly convex, all of them together, at all places, (N, nu)."""
+    bends = np.array(list(curvatures))
+    found: Mask = np.all(np.diagonal(bends, axis1=2, axis2=3) > 0, axis=0)
+    block = np.where(found[:, :, None] & found[:, None, :], bends, np.eye(bends.shape[-1]))
+    return np.asarray(found & (np.linalg.eigvalsh(block)[..., :1] > 0).all(axis=0))
 
-    def there(j: int, control: Array) -> list[Array]:
-        at = slice(j, j + 2 * n - 1, 2)  # of the nodes of the halved mesh
-        place = (t.e[at].T, (extremal.time[:-1] + j / 2 * h)[None, :])
-        known = (*repeated(t.duration, extremal.parameters, n), costates.state[at].T, costates.matrices[at].T)
-        return [stacked(v, n) for v in function.evaluated(t.x[at].T, control.T, *place, *known)]
 
-    values, slopes, curvatures = (
-        np.array(each) for each in zip(*(there(j, control) for j, control in enumerate(controls)), strict=True)
+def _among(convex: Mask, curvature: Array) -> Array:
+    """H_uu of the controls in which H is convex, beside a unit matrix."""
+    return np.where(convex[:, :, None] & convex[:, None, :], curvature, np.eye(convex.shape[1]))
+
+
+def _around(extremal: Extremal) -> Array:
+    """Controls that each interval may have instead: those of its ends and of the intervals beside it, (m, N, nu).
+
+    Where all of these are at one bound the other is among them, or the value farthest from it; where one control value
+    is all there is, both bounds, NaN where there are none.
+    """
+    u, constant = extremal.controls, extremal.mesh.control == "constant"
+    first, last = u[:-1], u[:-1] if constant else u[1:]
+    places = np.flatnonzero(np.diff(extremal.mesh.nodes) > 0)  # what is read at an instant has an interval of no length
+    lower, upper = extremal.statement.control_bounds
+    if constant and places.size < 2:
+        return np.array([np.where(np.isfinite(bound), bound, np.nan) + 0.0 * first for bound in (lower, upper)])
+    own = np.clip(np.searchsorted(places, np.arange(first.shape[0])), 0, places.size - 1)
+    before, after = places[np.maximum(own - 1, 0)], places[np.minimum(own + 1, places.size - 1)]
+    found = np.array([first[before], first, last, last[after]])
+    used = np.concatenate([first[places], last[places]])
+    least, most = (
+        np.where(np.isfinite(lower), lower, used.min(axis=0)),
+        np.where(np.isfinite(upper), upper, used.max(axis=0)),
     )
-    definite = np.asarray((np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0))
-    above = np.zeros((3, n))
-    if not definite.all():
-        held = [np.minimum(*(there(j, w)[0] for w in (u[:-1], ends))) for j in range(3)]
-        above = values[..., 0, 0] - np.minimum(np.array(held), values)[..., 0, 0]
-    return _Values(np.array(controls), slopes[..., 0], curvatures, definite, above)
+    near = AT_BOUND * (most - least)
+    other = np.where((found <= least + near).all(axis=0), most, first)
+    other = np.where((found >= most - near).all(axis=0), least, other)
+    return np.concatenate([found[[0, 3]] if constant else found, other[None]])
 
 
-def _by_points(extremal: Extremal, fine: Extremal, values: _Values, kinds: tuple[Mask, Mask]) -> float:
-    """By the Hamiltonian at the ends and in the middles of the intervals."""
-    st, (free, bounded) = extremal.statement, kinds
+def _by_points(extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask]) -> float:
+    """By the Hamiltonian at the ends and in the middles of the intervals, of the controls in which it is convex."""
+    bounds, (free, bounded) = extremal.statement.control_bounds, kinds
+    places = [(along.control(j), *along.at(j)[1:]) for j in range(3)]
     falls = [
-        np.where(bounded, _fall(*each, *st.control_bounds), 0.0).sum(axis=1)
-        for each in zip(values.u, values.slopes, values.curvatures, strict=True)
+        np.where(bounded & convex, _fall(u, slope[..., 0], bend, *bounds), 0.0).sum(axis=1) for u, slope, bend in places
     ]
-    definite, slopes = values.definite, np.where(free, values.slopes, 0.0)
-    curvature = np.where(definite[:, None, None], values.curvatures[1], np.eye(st.nu))
-    steps = np.linalg.solve(curvature, slopes[..., None])[..., 0]
+    slopes = np.array([np.where(free & convex, slope[..., 0], 0.0) for _, slope, _ in places])
+    steps = np.linalg.solve(_among(convex, places[1][2]), slopes[..., None])[..., 0]
     gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)
-    shares = np.where(definite, gained + SIMPSON @ np.array(falls), SIMPSON @ values.above)
-    return float(np.diff(extremal.time) @ shares)
+    return float(np.diff(extremal.time) @ (gained + SIMPSON @ np.array(falls)))
 
 
-def _by_middles(extremal: Extremal, fine: Extremal, values: _Values, kinds: tuple[Mask, Mask]) -> float | None:
+def _above(extremal: Extremal, left: Mask, around: Array) -> float:
+    """By how much H is above its least value with one of the controls around, each of those left by itself.
+
+    The differences are polynomials through five places of each interval: along a singular arc with constant controls
+    they vanish at both ends and in the middle.
+
+    Args:
+        extremal: whose limits are imposed at its nodes.
+        left: controls that count, (N, nu).
+        around: other controls for each interval, (m, N, nu).
+    """
+    along, total = _Along.of(extremal, PARTS), 0.0
+    for i in np.flatnonzero(left.any(axis=0)):
+        differences = np.zeros((around.shape[0], PARTS + 1, left.shape[0]))
+        for j in range(PARTS + 1):
+            u = along.control(j)
+            value = along.at(j, u)[0]
+            for difference, other in zip(differences, around, strict=True):
+                moved = u.copy()
+                moved[:, i] = other[:, i]
+                difference[j] = (along.at(j, moved)[0] - value)[:, 0, 0]
+        falls = np.maximum(-(SAMPLES @ differences).min(axis=0), 0.0).mean(axis=0)
+        total += float(np.diff(extremal.time) @ np.where(left[:, i], falls, 0.0))
+    return total
+
+
+def _by_middles(extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask]) -> float | None:
     """By what another value in the middle of each interval changes the discrete cost.
 
     Implicit steps that are longer than a fast state lives add up what it does, and so does their adjoint: its costate
@@ -120,16 +198,15 @@ def _by_middles(extremal: Extremal, fine: Extremal, values: _Values, kinds: tupl
     within a fraction of a step is not seen.
     """
     st, (free, bounded) = extremal.statement, kinds
-    kept, definite = free | bounded, values.definite
-    if not definite[kept.any(axis=1)].all():
+    if not convex[free | bounded].all():
         return None
     square, more = HAT if extremal.mesh.control == "linear" else STEP
     weights = square * np.where((h := np.diff(extremal.time)) > 0, h, 1.0)
-    slopes = np.where(h[:, None] > 0, discrete_costates(fine)[1][1::2], 0.0) / weights[:, None]
-    curvature = np.where(definite[:, None, None], values.curvatures[1], np.eye(st.nu))
+    slopes = np.where(h[:, None] > 0, discrete_costates(along.fine)[1][1::2], 0.0) / weights[:, None]
+    curvature = _among(convex, along.at(1)[2])
     inside = np.where(free, slopes, 0.0)
     gained = 0.5 * np.sum(inside * np.linalg.solve(curvature, inside[..., None])[..., 0], axis=1)
-    gained += np.where(bounded, _fall(values.u[1], slopes, curvature, *st.control_bounds), 0.0).sum(axis=1)
+    gained += np.where(bounded, _fall(along.control(1), slopes, curvature, *st.control_bounds), 0.0).sum(axis=1)
     return float(more * weights @ gained)
 
 

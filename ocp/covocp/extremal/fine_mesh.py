@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from math import lcm
 
 import numpy as np
 
@@ -92,18 +93,19 @@ def refined(extremal: Extremal) -> Extremal:
     return replace(extremal, mesh=fine, trajectory=trajectory, multipliers=multipliers)
 
 
-def halved(extremal: Extremal) -> Extremal:
-    """The same extremal with the middles of the intervals as nodes, its steps those of the mesh where their ends are.
+def with_parts(extremal: Extremal, parts: int) -> Extremal:
+    """The same extremal with equal parts of the intervals ended by nodes, its steps those of the mesh where these fit.
 
     Args:
         extremal: on a mesh whose limits are imposed at its nodes.
+        parts: of each interval.
     """
     st, mesh, m = extremal.statement, extremal.mesh, extremal.multipliers
     paired = 2 if st.running_uses_matrices else 1  # of Simpson's rule
-    substeps = mesh.substeps if mesh.substeps % (2 * paired) == 0 else 2 * mesh.substeps
+    substeps = lcm(mesh.substeps, parts * paired)
     nothing = replace(
         m,
-        inside_path=np.zeros((mesh.intervals, 1, m.path.shape[1])),
-        inside_states=np.zeros((mesh.intervals, 1, st.nx)),
+        inside_path=np.zeros((mesh.intervals, parts - 1, m.path.shape[1])),
+        inside_states=np.zeros((mesh.intervals, parts - 1, st.nx)),
     )
-    return refined(replace(extremal, mesh=replace(mesh, points=2, substeps=substeps), multipliers=nothing))
+    return refined(replace(extremal, mesh=replace(mesh, points=parts, substeps=substeps), multipliers=nothing))

@@ -31,6 +31,7 @@ from covocp.extremal.nodes import mapped
 from covocp.extremal.path_limits import acting
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.extremal.worth import worth_telling
 from covocp.statement.interval import model_symbols
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
@@ -39,6 +40,8 @@ from covocp.transcription.steering import quadrature_weights
 ACTIVE = 1e-5
 # A stationarity above which it is asked what it does to the cost.
 LARGE_SLOPE = 1e-5
+# Terms of H over the time, in the duality gap, up to which they are those of multipliers that the solver left.
+OF_MULTIPLIERS = 1e3
 # Costs below this count as zero.
 NO_COST = 1e-12
 # Share of the largest deviation of a state below which what is left of it is rounding; squared, of that of any state.
@@ -69,14 +72,17 @@ class Optimality:
         mesh_error: relative change of the cost by halving the integration steps.
         node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
             relative to its range.
-        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; where a
-            condition along the path or the bound of a state acts, the change by a finer mesh, with what limits that are
-            missed between the nodes are worth; nan where that was not to be had. None where implicit steps pass a
-            nominal so stiff that H is not known pointwise, and H_uu is not positive.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; of
+            controls in which H is not convex, int of what H is above its least value with the controls beside (nan of
+            one constant control without bounds); where a condition along the path or the bound of a state acts, the
+            change by a finer mesh, with what limits that are missed between the nodes are worth; nan where that was
+            not to be had. None where implicit steps pass a nominal so stiff that H is not known pointwise, and H_uu is
+            not positive.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
-            to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
-            had; nan where it would take too long. Negative: the solution is a saddle.
+            to its largest; 0 where its sign is below its error, or where what a negative one is worth between the
+            bounds of the controls is less than the mesh leaves or 1e-5 of the cost; None where nothing is left to move,
+            or it cannot be had; nan where it would take too long. Negative: the solution is a saddle.
         decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
             multipliers of its bounds; relative to the sum of the absolute terms or, where that is less, to a tenth of
             what of the cost is variable by the magnitude of the decision; None without decisions.
@@ -142,16 +148,17 @@ def assess(
         The record.
     """
     st = extremal.statement
-    slope, curvature, values, size = _at_nodes(extremal, costates)
+    slope, curvature, values, sizes = _at_nodes(extremal, costates)
     _, slopes, _ = discrete_costates(extremal)
-    scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
+    scale = max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)
     left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     others = 0.0 if within is None else within.size
+    size, gap = absolute_cost(extremal) + others, duality_gap(extremal)
     control_slope: float | None = 0.0
     control_error: float | None = 0.0
     if st.nu and acting(extremal):
-        known = change_on_finer_mesh(extremal, absolute_cost(extremal) + others, within)
+        known = change_on_finer_mesh(extremal, max(size, gap), within)
         control_slope, control_error = None, np.nan if known is None else known
     elif st.nu and free is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
@@ -160,7 +167,7 @@ def assess(
         control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2))) / scale
         whole = free[:-1] & free[1:]
         bounded = ~whole & ~(beside[:-1] | beside[1:])
-        control_error = estimate_control_error(extremal, (whole, bounded), others)
+        control_error = estimate_control_error(extremal, (whole, bounded), max(size, gap))
     found = Optimality(
         stationarity=_stationarity(extremal, left, scale, within) if st.nu else 0.0,
         control_slope=control_slope,
@@ -171,13 +178,15 @@ def assess(
         node_error=node_error(extremal),
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
-        curvature=_curvature(extremal, seconds) if within is None else None,
+        curvature=_curvature(extremal, seconds, mesh_error, control_error) if within is None else None,
         complementarity=complementarity(extremal, others),
         decisions=_decisions(extremal, costates, within),
         cost_identity=cost_identity,
         **_loop_identities(loop),
     )
-    nothing = max(absolute_cost(extremal) + others, float(values[:, 1].max())) <= ZERO_COST  # costs may cancel
+    terms = float(values[:, 1].max())  # costs may cancel
+    unknown = size <= gap <= NO_COST and terms * extremal.trajectory.duration <= OF_MULTIPLIERS * gap
+    nothing = max(size, terms) <= ZERO_COST or unknown
     return _of_nothing(found) if nothing else found
 
 
@@ -210,6 +219,11 @@ def complementarity(extremal: Extremal, others: float = 0.0) -> float:
         extremal: the solution.
         others: size of the cost of the rest of a chain.
     """
+    return duality_gap(extremal) / max(absolute_cost(refined(extremal)) + others, NO_COST)
+
+
+def duality_gap(extremal: Extremal) -> float:
+    """Sum of |multiplier| times distance from the bound: no cost is known better than to this."""
     extremal = refined(extremal)  # limits act at all its nodes
     st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
     groups: list[tuple[Array, Array, Array, Array]] = [
@@ -223,7 +237,7 @@ def complementarity(extremal: Extremal, others: float = 0.0) -> float:
     for weights, values, lower, upper in groups:
         kept, distance = complementary(weights, values, lower, upper)
         total += float(np.sum(np.abs(kept) * distance))
-    return total / max(absolute_cost(extremal) + others, NO_COST)
+    return total
 
 
 def identities(
@@ -382,11 +396,14 @@ def _decisions(extremal: Extremal, costates: Costates, within: Within | None) ->
     return decision_slopes(extremal, costates, within.start, within.variable).relative
 
 
-def _curvature(extremal: Extremal, seconds: float) -> float | None:
-    """Of a solution that is optimised, and no part of a chain."""
+def _curvature(extremal: Extremal, seconds: float, *errors: float | None) -> float | None:
+    """Of a solution that is optimised, and no part of a chain; errors: of its cost, those that are known."""
     if met_jumps(extremal, False, True):  # whose moments no derivative sees
         return np.nan
     result = smallest_curvature(extremal, seconds)
-    if result is None or result.verdict == "flat":
-        return None if result is None else 0.0
+    if result is None:
+        return None
+    error = sum(share for share in errors if share is not None and np.isfinite(share))
+    if result.verdict == "flat" or (result.verdict == "saddle" and not worth_telling(extremal, result, error)):
+        return 0.0
     return result.value / max(result.largest, np.finfo(float).tiny)

@@ -105,7 +105,7 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     if name == "curvature" and np.isnan(value):
         return _unknown_curvature(solution)
     if name == "curvature" and solution.converged:
-        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
+        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: sign or gain below the error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
@@ -125,7 +125,8 @@ def _not_known(solution: Solution) -> str:
     if solution.statement is not None:
         shares = acting(solution.extremal)
         if not shares:
-            return ""
+            alone = solution.trajectory.u.shape[0] == 1
+            return "NOT KNOWN, with one control value to compare: more intervals" if alone else ""
         where = max(shares, key=lambda name: shares[name])
         reason = f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
     return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="

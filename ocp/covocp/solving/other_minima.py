@@ -16,6 +16,7 @@ from covocp.extremal.cost_sizes import variable_cost
 from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
 from covocp.extremal.optimality import mention_saddle
+from covocp.extremal.worth import HARDLY, worth_telling
 from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
@@ -39,9 +40,6 @@ DISPLACEMENT = 0.3
 ESCAPES = (1.0, -1.0)
 # Share of the cost by which another end must be cheaper than the saddle, to be another one: not the same with roundoff.
 CHEAPER = 1e-9
-# Share of the cost that is not worth a word: a control that goes from bound to bound between two nodes is between them
-# at a node, where the cost is concave in it.
-HARDLY = 1e-5
 
 # Among the counts of a run what is told of several starts.
 OF_STARTS = ("starts", "asked")
@@ -112,7 +110,7 @@ def _off_saddle(
     limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
     better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
-        if candidates:
+        if candidates and worth_telling(outcome.extremal, curvature):
             mention_saddle(curvature.value / curvature.largest)
         return outcome
     best = min(better, key=cost_of)
@@ -141,7 +139,7 @@ def _suspicious(outcome: Outcome, start: Guess) -> bool:
 def _mention_left(outcome: Outcome, seconds: float) -> None:
     """Warn where a run from beside a saddle went no further: initial states may be in far too small a unit for it."""
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
-    if curvature is not None and curvature.verdict == "saddle":
+    if curvature is not None and curvature.verdict == "saddle" and worth_telling(outcome.extremal, curvature):
         mention_saddle(curvature.value / curvature.largest)
 
 
