@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.extremal.extremal import Merit
@@ -151,3 +152,32 @@ def test_what_is_worth_a_run():
     wrong = [(Merit(2.0, 0.5, 0.0), "own"), (Merit(9.0, 0.2, 0.0), "other")]
     assert worth_a_run(wrong) == ["other", "own"]
     assert worth_a_run([(Merit(np.nan, 0.0, 0.0), "own"), (near, "near")]) == ["own"]
+
+
+@pytest.mark.parametrize("weight", [1.0, 10.0])
+def test_a_free_duration_does_not_end_where_nothing_is_learnt(weight):
+    """x' = -b x + v, v' = u in a time that is paid: 5.004 at the lower limit of the time had been called solved.
+
+    Reference: the push at full rate to full speed, held, integrated by scipy over some durations, of which the best
+    need not be as good as the best of all controls.
+    """
+    ocp = co.Problem(co.Free(3.0, 0.2, 30.0))
+    x = ocp.state("x", initial=0.0, variance=0.1)
+    b = ocp.unknown("b", mean=1.0, variance=0.5)
+    v = ocp.state("v", initial=0.0, lower=-1, upper=1)
+    u = ocp.control("u", lower=-2, upper=2)
+    ocp.dynamics(v, u)
+    ocp.dynamics(x, -b * x + v, noise=0.01)
+    ocp.measurement("y", x, noise=0.05)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.02, terminal=weight * E[b, b])
+
+    def rate(t, z):
+        x, a, c, d = z
+        seen = np.array([a, c]) / 0.05
+        return [-x + min(2 * t, 1.0), 0.01 - 2 * (a + x * c) - a * seen[0], -c - x * d - c * seen[0], -c * seen[1]]
+
+    times = np.linspace(0.2, 12.0, 119)
+    run = solve_ivp(rate, (0, 12.0), [0.0, 0.1, 0.0, 0.5], t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.05)
+    reference = (0.02 * times + weight * run.y[3]).min()
+    assert co.solve(ocp, points=2, progress=False).cost <= reference * (1 + 1e-4)

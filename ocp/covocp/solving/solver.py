@@ -41,6 +41,7 @@ from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
+from covocp.solving.held_duration import off_the_limit
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
@@ -296,11 +297,12 @@ class Solver:
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
-        ran = (lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start)
-        outcome, prepared = in_larger_units(*ran, first=not self._ran)
+        ready, where = partial(self._ready, self._options), (values, reporter, start)
+        outcome, prepared = in_larger_units(ready, self._prepared, outcome, *where, first=not self._ran)
         self._ran = True
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
+        outcome = off_the_limit(ready, self._prepared, outcome, *where)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(
