@@ -252,8 +252,8 @@ class Solver:
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
-            if self.nominal == "deterministic":
-                outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
+                if self.nominal == "deterministic":
+                    outcome = self._closed(outcome, values, reporter)
             if reporter.asked:
                 raise interrupted(Solution.of(outcome, self._by))
             outcome = with_gain_told(self._problem, outcome, first)
@@ -439,7 +439,7 @@ class Solver:
             self._suit(values, nodes=False)
             guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
             outcome, _ = from_starts(self._prepared, values, guesses, reporter)
-            outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
+            outcome = self._closed(outcome, values, reporter)
             if reporter.stop:
                 raise KeyboardInterrupt
         if outcome.converged:
@@ -464,15 +464,25 @@ class Solver:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
             finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
-            if finer is None:
+            again = None if finer is None else self._again_by(finer, outcome, values, reporter)
+            if again is None:
                 break
-            found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
-            if found is None:
-                break
-            again, prepared = found
-            outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
-            self._keep(finer, prepared)
+            outcome = again
         return outcome
+
+    def _again_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
+        """An outcome by shorter steps, which later runs take then; None where that fails."""
+        found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
+        if found is None:
+            return None
+        again, prepared = found
+        self._keep(finer, prepared)
+        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
+
+    def _closed(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """Filter and feedback around the nominal of the deterministic cost."""
+        again = partial(self._again_by, outcome=outcome, values=values, reporter=reporter)
+        return closed_around(outcome, self.statement, self._options, own_steps=self._own_steps, again=again)
 
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
