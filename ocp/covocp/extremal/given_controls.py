@@ -56,12 +56,12 @@ def evaluate_controls(
 
     Args:
         statement: the problem.
-        mesh: of one segment; each interval is one where states are held.
+        mesh: of one segment; where states are held of those that begin there.
         u: control values, (N + 1 or N, nu).
         duration: T [s].
         parameters: of the statement.
         start: state at the start; None: the statement's, free entries guessed.
-        held: states at the nodes, (N + 1, nx), of a plan that these controls belong to: each interval is run from its
+        held: states at the nodes, (N + 1, nx), of a plan that these controls belong to: each segment is run from its
             own, where one run from the start would not stay there. None: one run; also of a coupled problem.
     """
     x0, e0 = starts(statement, mesh, parameters)
@@ -71,9 +71,8 @@ def evaluate_controls(
         given: tuple[Any, ...] = (u.T, x0, e0, duration, parameters)
         run = _one_run(statement, mesh)
     else:
-        mesh = each_interval(mesh)
-        given = (u.T, np.vstack([x0, held[1:]]).T, e0, duration, parameters)
-        run = _runs_of_intervals(statement, mesh)
+        given = (u.T, np.vstack([x0, held[list(mesh.starts[1:])]]).T, e0, duration, parameters)
+        run = _runs_of_segments(statement, mesh)
     at_nodes, halves, running = (np.asarray(value.full()) for value in run(*given))
     trajectory = Trajectory(x=at_nodes.T, u=u, e=halves.T, duration=duration)
     terminal = float(statement.terminal(trajectory.x[-1], trajectory.e[-1], duration, parameters))
@@ -145,9 +144,9 @@ def _one_run(statement: Statement, mesh: Mesh) -> ca.Function:
     return ca.Function("along", symbols, [x, e, ca.sum2(cost)])
 
 
-def _runs_of_intervals(statement: Statement, mesh: Mesh) -> ca.Function:
-    """The same of intervals that are run each from a state of its own, the matrices along all of them."""
-    symbols = _symbols(statement, mesh, mesh.intervals + 1)
+def _runs_of_segments(statement: Statement, mesh: Mesh) -> ca.Function:
+    """The same of segments that are run each from a state of its own, the matrices along all of them."""
+    symbols = _symbols(statement, mesh, len(mesh.starts))
     variables = SimpleNamespace(**dict(zip(("u", "x", "e", "duration", "parameters"), symbols, strict=True)))
     found = shoot(statement, mesh, variables, passage=values_by)
     return ca.Function("along", symbols, [found["x"], found["e"], ca.sum2(found["cost"])])

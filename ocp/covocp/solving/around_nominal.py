@@ -17,6 +17,7 @@ from covocp.extremal.extremal import Outcome
 from covocp.extremal.given_controls import (
     DRIFTED,
     drift,
+    each_interval,
     evaluate_controls,
     evaluation_mesh,
     gaps_left,
@@ -56,11 +57,12 @@ class _Nominal:
         """Filter and feedback around it, on the mesh of some options."""
         found = self.outcome.extremal
         t, mesh = found.trajectory, evaluation_mesh(self.statement, options, found.parameters)
-        states = t.x if self.held else None
-        given = (self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
-        closed = evaluate_controls(*given, held=states)
+        given = (t.u, t.duration, found.parameters, t.x[0])
+        if not self.held:
+            return evaluate_controls(self.statement, mesh, *given)
+        closed = evaluate_controls(self.statement, each_interval(mesh), *given, held=t.x)
         gaps = found.multipliers.gaps
-        if not self.held or gaps.shape[0] != t.x.shape[0] - 1:
+        if gaps.shape[0] != t.x.shape[0] - 1:
             return closed
         return with_costates(closed, np.vstack([gaps[:1], gaps])[:, : self.statement.nx])
 

@@ -16,7 +16,14 @@ from covocp.base.matrices import Array, distinct, near
 from covocp.base.quadrature import interpolated
 from covocp.extremal.dense_output import between_nodes
 from covocp.extremal.extremal import Extremal, Outcome
-from covocp.extremal.given_controls import DRIFTED, drift, evaluate_controls, evaluation_mesh, with_costates
+from covocp.extremal.given_controls import (
+    DRIFTED,
+    drift,
+    each_interval,
+    evaluate_controls,
+    evaluation_mesh,
+    with_costates,
+)
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
@@ -117,7 +124,7 @@ def run_along(
     states = _left(statement, nominal, run, parameters) if isinstance(nominal, Solution) else None
     if states is None:
         return run
-    held = evaluate_controls(statement, mesh, u, duration, parameters, x0, states)
+    held = evaluate_controls(statement, each_interval(mesh), u, duration, parameters, x0, states)
     if not held.converged:
         return run
     costates = interpolated(nominal.costates.state, nominal.mesh.nodes, mesh.nodes)

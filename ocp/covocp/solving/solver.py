@@ -29,7 +29,7 @@ from covocp.solving import refining
 from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
-from covocp.solving.beside_classical import ClassicalDesign, Costs
+from covocp.solving.beside_classical import ClassicalDesign
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.continued import again_on, continued
@@ -39,6 +39,8 @@ from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure, possible
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
+from covocp.solving.from_classical import PATIENCE as SOON
+from covocp.solving.from_classical import from_classical, impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
 from covocp.solving.loosened import PATIENCE
@@ -129,6 +131,7 @@ class Solver:
         self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = self._ran = False  # at the steps along the guess; from a start
+        self._last: tuple[Array, Outcome] | None = None  # values, and what came of them by itself
         self._borne: Beginning | None = None  # what the nodes are known to be graded for
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
@@ -137,6 +140,12 @@ class Solver:
         self._otherwise = bool(self._best) and self._by_ipopt and "max_iterations" not in self._own
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
+        self._soon = (
+            nominal == "combined" and self._by_ipopt and refine is None and impatient(self.statement, self._own)
+        )
+        self._patient: dict[str, Any] = {"max_iterations": None} if self._soon else {}
+        if self._soon:
+            self._own["max_iterations"] = SOON
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = self._ready(self._options)
@@ -296,9 +305,29 @@ class Solver:
         ran = (lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start)
         outcome, prepared = in_larger_units(*ran, first=not self._ran)
         self._ran = True
+        if not outcome.converged:
+            outcome, prepared = self._from_classical(outcome, prepared, values, reporter)
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
+
+    def _from_classical(
+        self, failed: Outcome, prepared: Prepared, values: Array, reporter: Progress
+    ) -> tuple[Outcome, Prepared]:
+        """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on."""
+        if self.nominal != "combined" or not self.statement.behind:
+            return failed, prepared
+        classical, ready = (
+            partial(self._classical.nominal, values),
+            partial(self._ready, self._options, **self._patient),
+        )
+        outcome, prepared = from_classical(failed, prepared, ready, classical, values, reporter)
+        if outcome.converged or reporter.stop or not self._soon:
+            return outcome, prepared
+        prepared = self._ready(self._options, **self._patient)
+        guesses = make_guesses(self._solved, prepared.mesh, values, None)
+        again, _ = from_starts(prepared, values, guesses, reporter)
+        return with_stats(again, **counted(outcome, again)), prepared
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
@@ -424,7 +453,7 @@ class Solver:
 
     def _classical_design(self) -> ClassicalDesign:
         """The classical design on the present mesh."""
-        make = partial(_classical_costs, self._problem)
+        make = partial(_deterministic, self._problem)
         return ClassicalDesign(statement=self.statement, options=self._options, make=make)
 
     def _continued(self, values: Array, solution: Solution) -> Solution:
@@ -433,12 +462,22 @@ class Solver:
         again = partial(self._ready, self._options, tolerance=CONTINUED * tolerance)
         return continued(again, self._solved, values, solution, self._by)
 
-    def _cost_of_values(self, values: Array) -> tuple[float, str]:
-        """Cost of the classical design for stacked parameters, and why there is none."""
+    def nominal_of_values(self, values: Array) -> Outcome:
+        """The outcome without what is looked at after a run, for stacked parameters; the last one is remembered."""
         with evaluating(self.statement.name), Progress("", show=False) as reporter:
-            self._suit(values, nodes=False)
-            guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
-            outcome, _ = from_starts(self._prepared, values, guesses, reporter)
+            if self._last is None or not np.array_equal(self._last[0], values):
+                self._suit(values, nodes=False)
+                guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
+                self._last = values, from_starts(self._prepared, values, guesses, reporter)[0]
+            if reporter.stop:
+                self._last = None
+                raise KeyboardInterrupt
+            return self._last[1]
+
+    def cost_of_values(self, values: Array) -> tuple[float, str]:
+        """Cost of the classical design for stacked parameters, and why there is none."""
+        outcome = self.nominal_of_values(values)
+        with evaluating(self.statement.name), Progress("", show=False) as reporter:
             outcome = self._closed(outcome, values, reporter)
             if reporter.stop:
                 raise KeyboardInterrupt
@@ -516,7 +555,7 @@ class Solver:
         return told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
 
 
-def _classical_costs(problem: Problem, options: Options) -> Costs:
-    """What gives the cost of the classical design for values of the parameters, on the mesh of some options."""
+def _deterministic(problem: Problem, options: Options) -> Solver:
+    """What solves for the classical design, on the mesh of some options."""
     mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
-    return Solver(problem, "ipopt", nominal="deterministic", **mesh)._cost_of_values
+    return Solver(problem, "ipopt", nominal="deterministic", **mesh)

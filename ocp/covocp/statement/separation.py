@@ -39,15 +39,16 @@ def separates(statement: Statement) -> bool:
 
 @lru_cache(maxsize=KEPT)
 def quadratic(statement: Statement) -> bool:
-    """Whether a statement without matrices has affine rates and conditions and a quadratic cost."""
-    if statement.nominal is None or statement.matrices or statement.duration.free or statement.decisions:
+    """Whether the deterministic problem of an expected cost has affine rates and conditions and a quadratic cost."""
+    loop = statement.loop
+    if loop is None or statement.nominal is None or statement.duration.free or statement.decisions:
         return False
     _, _, e, time, duration, p = model_symbols(statement)
     symbolic: Any = statement.symbolic
     z = symbolic.sym("z", statement.nx + statement.nu)
     x, u = z[: statement.nx], z[statement.nx :]
-    rate, running = statement.nominal(x, u, time, duration, p)
-    terminal = statement.terminal(x, e, duration, p)
+    rate, running = statement.nominal(x, u, time, duration, p)[0], loop.running(x, u, time, duration, p)
+    terminal = loop.terminal(x, duration, p)[0]
     conditions = [one.function(x, u, e, time, duration, p) for one in statement.conditions if one.size]
     slopes = [ca.gradient(value, z) for value in (running, terminal)]
     return not any(any(ca.which_depends(value, z, 2)) for value in (rate, *conditions, *slopes))
