@@ -47,7 +47,7 @@ from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
-from covocp.solving.other_ways import Way, other_ways, told_ways
+from covocp.solving.other_ways import Way, other_covariances, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
@@ -551,8 +551,9 @@ class Solver:
         if not self._by_ipopt or beyond(self._problem.declarations, best):
             return ""
         if self.method == "ipopt" and is_suited(self._solved, self._prepared.mesh):
-            return OTHER_WAY
-        return told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
+            return OTHER_WAY + other_covariances(self._solved, self._options, self._prepared.mesh)
+        told = told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
+        return told or other_covariances(self._solved, self._options, self._prepared.mesh)
 
 
 def _deterministic(problem: Problem, options: Options) -> Solver:
