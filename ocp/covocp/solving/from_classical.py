@@ -21,7 +21,8 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls
 from covocp.extremal.mesh_error import COARSE_MESH
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import counted, with_stats
+from covocp.solving.attempts import counted, from_starts, with_stats
+from covocp.solving.warm_start import make_guesses
 from covocp.statement.separation import quadratic, separates
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -81,6 +82,18 @@ def from_classical(
         return failed, prepared
     counts = counted(failed, outcome)
     return (with_stats(outcome, **counts), again) if outcome.converged else (with_stats(failed, **counts), prepared)
+
+
+def patiently(
+    failed: Outcome, prepared: Prepared, ready: Callable[[], Prepared], values: Array, reporter: Progress
+) -> tuple[Outcome, Prepared]:
+    """A run that was given up soon, where nothing else led on, made again with as many iterations as any other."""
+    if failed.converged or reporter.stop:
+        return failed, prepared
+    prepared = ready()
+    guesses = make_guesses(failed.extremal.statement, prepared.mesh, values, None)
+    outcome, _ = from_starts(prepared, values, guesses, reporter)
+    return with_stats(outcome, **counted(failed, outcome)), prepared
 
 
 def _is_stationary(outcome: Outcome) -> bool:

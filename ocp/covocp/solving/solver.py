@@ -40,7 +40,7 @@ from covocp.solving.failure import failure, possible
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.from_classical import PATIENCE as SOON
-from covocp.solving.from_classical import from_classical, impatient
+from covocp.solving.from_classical import from_classical, impatient, patiently
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
 from covocp.solving.loosened import PATIENCE
@@ -317,17 +317,9 @@ class Solver:
         """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on."""
         if self.nominal != "combined" or not self.statement.behind:
             return failed, prepared
-        classical, ready = (
-            partial(self._classical.nominal, values),
-            partial(self._ready, self._options, **self._patient),
-        )
-        outcome, prepared = from_classical(failed, prepared, ready, classical, values, reporter)
-        if outcome.converged or reporter.stop or not self._soon:
-            return outcome, prepared
-        prepared = self._ready(self._options, **self._patient)
-        guesses = make_guesses(self._solved, prepared.mesh, values, None)
-        again, _ = from_starts(prepared, values, guesses, reporter)
-        return with_stats(again, **counted(outcome, again)), prepared
+        ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
+        outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)
+        return patiently(outcome, prepared, ready, values, reporter) if self._patient else (outcome, prepared)
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
