@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,14 +35,14 @@ WORSE = 1e-6
 STEPS = 10.0
 
 
-class Deterministic(Protocol):
-    """What solves the deterministic problem."""
+class Deterministic(NamedTuple):
+    """What solves the deterministic problem for values of the parameters.
 
-    def cost_of_values(self, values: Array) -> tuple[float, str]:
-        """What the classical design costs for values of the parameters, and why there is none."""
+    costs: what the classical design costs, and why there is none. nominal: the outcome without noise.
+    """
 
-    def nominal_of_values(self, values: Array) -> Outcome:
-        """Its nominal."""
+    costs: Callable[[Array], tuple[float, str]]
+    nominal: Callable[[Array], Outcome]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,7 +70,7 @@ class ClassicalDesign:
         """Its nominal; None where there is none."""
         try:
             with without_warnings():  # they concern another solution
-                return self.solver.nominal_of_values(parameters)
+                return self.solver.nominal(parameters)
         except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved
             return None
 
@@ -87,7 +87,7 @@ class ClassicalDesign:
         """
         try:
             with without_warnings():  # they concern another solution
-                classical, missing = self.solver.cost_of_values(parameters)
+                classical, missing = self.solver.costs(parameters)
                 if left_open(solution, classical):
                     classical = self._on_equal_steps(classical, mesh, parameters)
         except KeyboardInterrupt:
@@ -116,7 +116,7 @@ class ClassicalDesign:
         options = with_substeps(self.options, mesh, mesh.substeps)
         if options.substeps == self.options.substeps:
             return classical
-        cost, missing = self.make(options).cost_of_values(parameters)
+        cost, missing = self.make(options).costs(parameters)
         return classical if missing else max(classical, cost)
 
 

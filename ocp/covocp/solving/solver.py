@@ -29,7 +29,7 @@ from covocp.solving import refining
 from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
-from covocp.solving.beside_classical import ClassicalDesign
+from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.continued import again_on, continued
@@ -140,12 +140,10 @@ class Solver:
         self._otherwise = bool(self._best) and self._by_ipopt and "max_iterations" not in self._own
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
-        self._soon = (
-            nominal == "combined" and self._by_ipopt and refine is None and impatient(self.statement, self._own)
-        )
-        self._patient: dict[str, Any] = {"max_iterations": None} if self._soon else {}
-        if self._soon:
-            self._own["max_iterations"] = SOON
+        whole = nominal == "combined" and self._by_ipopt and refine is None
+        self._patient: dict[str, Any] = {}  # options of a run that is not given up soon
+        if whole and impatient(self.statement, self._own):
+            self._own, self._patient = {**self._own, "max_iterations": SOON}, {"max_iterations": None}
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = self._ready(self._options)
@@ -454,7 +452,7 @@ class Solver:
         again = partial(self._ready, self._options, tolerance=CONTINUED * tolerance)
         return continued(again, self._solved, values, solution, self._by)
 
-    def nominal_of_values(self, values: Array) -> Outcome:
+    def _nominal_of_values(self, values: Array) -> Outcome:
         """The outcome without what is looked at after a run, for stacked parameters; the last one is remembered."""
         with evaluating(self.statement.name), Progress("", show=False) as reporter:
             if self._last is None or not np.array_equal(self._last[0], values):
@@ -466,9 +464,9 @@ class Solver:
                 raise KeyboardInterrupt
             return self._last[1]
 
-    def cost_of_values(self, values: Array) -> tuple[float, str]:
+    def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
-        outcome = self.nominal_of_values(values)
+        outcome = self._nominal_of_values(values)
         with evaluating(self.statement.name), Progress("", show=False) as reporter:
             outcome = self._closed(outcome, values, reporter)
             if reporter.stop:
@@ -548,7 +546,8 @@ class Solver:
         return told or other_covariances(self._solved, self._options, self._prepared.mesh)
 
 
-def _deterministic(problem: Problem, options: Options) -> Solver:
+def _deterministic(problem: Problem, options: Options) -> Deterministic:
     """What solves for the classical design, on the mesh of some options."""
     mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
-    return Solver(problem, "ipopt", nominal="deterministic", **mesh)
+    solver = Solver(problem, "ipopt", nominal="deterministic", **mesh)
+    return Deterministic(costs=solver._cost_of_values, nominal=solver._nominal_of_values)
