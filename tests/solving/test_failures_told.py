@@ -153,3 +153,20 @@ def test_a_violation_that_has_not_fallen_for_long_is_counted():
     assert progress.stalled(3) == 0  # it came to where nothing is violated
     assert progress.stalled(299) < 10
     assert progress.stalled(77) == 0  # there was none
+
+
+@pytest.mark.parametrize(("asked", "named"), [("auto", "covariances='eliminated' may find a way"), ("states", "")])
+def test_the_other_formulation_of_the_covariances_is_named(asked, named):
+    """A limit of log E took 28 s in vain as states, and 0.2 s eliminated; 'auto' was all that was told."""
+    ocp = co.Problem(2.0, name="learning")
+    x, u = ocp.state("x", initial=0.0, variance=0.1), ocp.control("u", lower=-3, upper=3, guess=0.5)
+    b = ocp.unknown("b", mean=1.0, variance=100.0)
+    ocp.dynamics(x, u, noise=0.01)
+    ocp.measurement("m", b * x, noise=0.01)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.05 * u**2, terminal=E[b, b])
+    ocp.subject_to(ca.log(E[b, b]), upper=10.0)
+    with pytest.raises(co.SolveError) as failed:
+        co.solve(ocp, covariances=asked, max_iterations=1, progress=False)
+    assert named in str(failed.value)
+    assert ("covariances=" in str(failed.value)) == bool(named)

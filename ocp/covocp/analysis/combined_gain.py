@@ -26,13 +26,14 @@ from covocp.base.pages import Section, Sentence, Table, as_html, as_text
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.curvature import held_jacobian, mass_matrix
-from covocp.extremal.extremal import Extremal
+from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.beside_classical import is_roundoff
 from covocp.solving.evaluation import evaluate
 from covocp.solving.once import solve
+from covocp.statement.separation import separates
 from covocp.transcription.first_guess import control_scale
 from covocp.transcription.mesh import Options
 from covocp.transcription.scales import magnitudes
@@ -44,6 +45,9 @@ CORRECTIONS, MET = 12, 1e-8
 # Largest miss of a final value, in the magnitude of its state, that is weighed to first order.
 MISSED = 1e-3
 STEPS = tuple(2.0 ** np.arange(2, -13, -1))
+# Share of its cost by which that of a run along the controls of a classical design may differ: one that leaves the
+# nominal of an unstable plant says nothing of what changes of the controls cost.
+FOLLOWED = 1e-5
 # Relative gains below which the classical design is as good, and above which the combined one is worth its while.
 NOTHING, MUCH = 1e-4, 1e-2
 
@@ -118,7 +122,8 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = No
 
     Raises:
         ProblemError: no expected cost, constrained gains; decisions, or no deterministic cost, and no `nominal`.
-        SolveError: the deterministic problem was not solved, or something is NaN or inf along the nominal.
+        SolveError: the deterministic problem was not solved, something is NaN or inf along the nominal, or a run along
+            its controls leaves it: the plant is too unstable to look along them.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
     expected = problem.declarations.expected
@@ -144,14 +149,17 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = No
     _check_numbers(classical)
     size, extremal = abs(classical.cost), classical.extremal
     mesh = Options(grid=distinct(extremal.mesh.nodes), control=classical.mesh.control)  # type: ignore[arg-type]
-    if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
+    alike = nominal is None and separates(extremal.statement)
+    if alike or is_roundoff(size, extremal.statement, mesh, extremal.parameters):
         still = np.zeros_like(extremal.trajectory.u)
         return Worth(classical=classical, first_order=0.0, gain=0.0, direction=still, step=0.0)
-    direction, ell, slope = _statistical_gradient(extremal)
+    along = _followed(classical)
+    cost = float(sum(along.cost_terms.values()))
+    direction, ell, slope = _statistical_gradient(along.extremal)
     first = float(-np.sum(slope * direction)) / size
     gain, best = 0.0, 0.0
     for step in STEPS if first > np.finfo(float).eps else ():
-        decrease = _decrease(classical, step * direction, ell) / size
+        decrease = (cost - _changed(along.extremal, step * direction, ell)) / size
         if decrease > gain:
             gain, best = decrease, step
         elif best:
@@ -175,6 +183,31 @@ def _check_numbers(classical: Solution) -> None:
             remedy="give another nominal, or bounds that keep the model in its domain",
             solution=classical,
         )
+
+
+def _followed(classical: Solution) -> Outcome:
+    """The classical design by one run along its controls, which must stay at its nominal.
+
+    Raises:
+        SolveError: it does not.
+    """
+    own, t = classical.extremal, classical.extremal.trajectory
+    if len(own.mesh.segments) == 1:
+        terms = dict(classical.cost_terms)
+        return Outcome(extremal=own, cost_terms=terms, converged=True, message="", violations={}, stats={})
+    mesh = replace(own.mesh, segments=(own.mesh.intervals,), eliminated=True)
+    run = evaluate_controls(own.statement, mesh, t.u, t.duration, own.parameters, t.x[0])
+    cost = float(sum(run.cost_terms.values()))
+    if run.converged and abs(cost - classical.cost) <= FOLLOWED * abs(classical.cost):
+        return run
+    raise SolveError(
+        f"worth() looks along the controls, and '{classical.name}' is too unstable for that: by roundoff a run along "
+        "those of the classical design leaves its nominal.",
+        expected=f"an expected cost of {classical.cost:.8g} of that run",
+        received=f"{cost:.8g}",
+        remedy="compare the costs of both designs: solve(problem), and solve(problem, nominal='deterministic')",
+        solution=classical,
+    )
 
 
 def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
@@ -219,12 +252,12 @@ def _metric(extremal: Extremal) -> Array | None:
     return np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1).full(), curvature))
 
 
-def _decrease(classical: Solution, change: Array, ell: Array) -> float:
-    """Decrease of the expected cost by a change of the controls, within their bounds and to the same final values.
+def _changed(extremal: Extremal, change: Array, ell: Array) -> float:
+    """The expected cost after a change of the controls, within their bounds and to the same final values.
 
-    What steering leaves of a miss is weighed by l; where bounds leave much of it the change is none that is possible.
+    What steering leaves of a miss is weighed by l; where bounds leave much of it the change is none that is possible,
+    and costs inf.
     """
-    extremal = classical.extremal
     st, t = extremal.statement, extremal.trajectory
     mesh = replace(extremal.mesh, segments=(extremal.mesh.intervals,), eliminated=True)
     u, fixed = np.clip(t.u + change, *st.control_bounds), ~np.isnan(st.boundary_values(extremal.parameters)[1])
@@ -236,9 +269,9 @@ def _decrease(classical: Solution, change: Array, ell: Array) -> float:
     outcome = evaluate_controls(st, mesh, u, t.duration, extremal.parameters, t.x[0])
     missed = (outcome.extremal.trajectory.x[-1] - t.x[-1])[fixed]
     if not (np.abs(missed) <= MISSED * scales.x[fixed]).all():
-        return -np.inf
+        return np.inf
     cost = float(sum(outcome.cost_terms.values())) + float(ell[: missed.size] @ missed)
-    return classical.cost - cost if np.isfinite(cost) else -np.inf
+    return cost if np.isfinite(cost) else np.inf
 
 
 def _met(run: Run, fixed: tuple[int, ...], target: Array, u: Array) -> Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -10,17 +12,21 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.row_units import varied_by
+from covocp.passage.sweep import values_by
 from covocp.statement.conditions import Conditions, Inside, beyond
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
+from covocp.transcription.halved_steps import refined_run
 from covocp.transcription.limit_units import limit_units
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import Scales
-from covocp.transcription.scales import choose_scales
-from covocp.transcription.shooting import single_shooting
+from covocp.transcription.scales import choose_scales, magnitudes
+from covocp.transcription.shooting import shoot, single_shooting
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
+# A run along the controls of a nominal that leaves it by more than this, in magnitudes of the states, is another one.
+DRIFTED = 1e-3
 # Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions in the unit
 # of their limits.
 MISS = 1e-6
@@ -38,31 +44,36 @@ def evaluation_mesh(statement: Statement, options: Options, parameters: Array) -
 
 
 def evaluate_controls(
-    statement: Statement, mesh: Mesh, u: Array, duration: float, parameters: Array, start: Array | None = None
+    statement: Statement,
+    mesh: Mesh,
+    u: Array,
+    duration: float,
+    parameters: Array,
+    start: Array | None = None,
+    held: Array | None = None,
 ) -> Outcome:
     """The outcome of given controls: states and matrices from the start, costs, what is missed.
 
     Args:
         statement: the problem.
-        mesh: of one segment.
+        mesh: of one segment; where states are held of those that begin there.
         u: control values, (N + 1 or N, nu).
         duration: T [s].
         parameters: of the statement.
         start: state at the start; None: the statement's, free entries guessed.
+        held: states at the nodes, (N + 1, nx), of a plan that these controls belong to: each segment is run from its
+            own, where one run from the start would not stay there. None: one run; also of a coupled problem.
     """
     x0, e0 = starts(statement, mesh, parameters)
     x0, e0 = statement.started(x0 if start is None else start, parameters, e0)
     u = np.asarray(mesh.acting(u.T)).T
-    symbols = [
-        ca.MX.sym("u", statement.nu, mesh.control_nodes),
-        ca.MX.sym("x0", statement.nx),
-        ca.MX.sym("e0", statement.ne),
-        ca.MX.sym("T"),
-        ca.MX.sym("p", statement.np),
-    ]
-    x, e, cost = single_shooting(statement, mesh, symbols[0], tuple(symbols[1:]))
-    outputs = ca.Function("along", symbols, [x, e, ca.sum2(cost)])(u.T, x0, e0, duration, parameters)
-    at_nodes, halves, running = (np.asarray(value.full()) for value in outputs)
+    if held is None or statement.coupled:
+        given: tuple[Any, ...] = (u.T, x0, e0, duration, parameters)
+        run = _one_run(statement, mesh)
+    else:
+        given = (u.T, np.vstack([x0, held[list(mesh.starts[1:])]]).T, e0, duration, parameters)
+        run = _runs_of_segments(statement, mesh)
+    at_nodes, halves, running = (np.asarray(value.full()) for value in run(*given))
     trajectory = Trajectory(x=at_nodes.T, u=u, e=halves.T, duration=duration)
     terminal = float(statement.terminal(trajectory.x[-1], trajectory.e[-1], duration, parameters))
     extremal = Extremal(
@@ -81,6 +92,64 @@ def evaluate_controls(
         violations=missed(extremal) if finite else {},
         stats={},
     )
+
+
+def with_costates(outcome: Outcome, costates: Array) -> Outcome:
+    """An outcome whose intervals are run from states that are held, with costates of these at the nodes, (N + 1, nx).
+
+    They tell what gaps between the intervals, by shorter steps, change of the cost; along an unstable plant those that
+    are swept from the end are roundoff of what is there.
+    """
+    own = outcome.extremal
+    if len(own.mesh.segments) != own.mesh.intervals or not np.isfinite(costates).all():
+        return outcome
+    return replace(outcome, extremal=replace(own, multipliers=replace(own.multipliers, gaps=costates[1:])))
+
+
+def gaps_left(run: Extremal) -> float:
+    """What the segments of a run miss of the states where the next ones begin, all together, in their magnitudes."""
+    statement, t = run.statement, run.trajectory
+    gaps = refined_run(statement, run.mesh, t, run.parameters, parts=1).jumps[:, : statement.nx]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float((np.abs(gaps).sum(axis=0) / magnitudes(statement, t, run.parameters).x).max(initial=0.0))
+
+
+def drift(x: Array, run: Extremal) -> float:
+    """By how much a run along the controls leaves states at the nodes that are meant, in their magnitudes."""
+    scale = magnitudes(run.statement, replace(run.trajectory, x=x), run.parameters).x
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float((np.abs(run.trajectory.x - x) / scale).max(initial=0.0))
+
+
+def each_interval(mesh: Mesh) -> Mesh:
+    """The mesh with a shooting segment for each interval."""
+    return replace(mesh, segments=(1,) * mesh.intervals)
+
+
+def _symbols(statement: Statement, mesh: Mesh, starts: int) -> list[ca.MX]:
+    """Controls, states at so many places, half-vectors at the start, T and parameters."""
+    return [
+        ca.MX.sym("u", statement.nu, mesh.control_nodes),
+        ca.MX.sym("x", statement.nx, starts),
+        ca.MX.sym("e0", statement.ne),
+        ca.MX.sym("T"),
+        ca.MX.sym("p", statement.np),
+    ]
+
+
+def _one_run(statement: Statement, mesh: Mesh) -> ca.Function:
+    """States and half-vectors at the nodes and the running cost of one run from the start."""
+    symbols = _symbols(statement, mesh, 1)
+    x, e, cost = single_shooting(statement, mesh, symbols[0], tuple(symbols[1:]))
+    return ca.Function("along", symbols, [x, e, ca.sum2(cost)])
+
+
+def _runs_of_segments(statement: Statement, mesh: Mesh) -> ca.Function:
+    """The same of segments that are run each from a state of its own, the matrices along all of them."""
+    symbols = _symbols(statement, mesh, len(mesh.starts))
+    variables = SimpleNamespace(**dict(zip(("u", "x", "e", "duration", "parameters"), symbols, strict=True)))
+    found = shoot(statement, mesh, variables, passage=values_by)
+    return ca.Function("along", symbols, [found["x"], found["e"], ca.sum2(found["cost"])])
 
 
 def missed(extremal: Extremal) -> dict[str, float]:

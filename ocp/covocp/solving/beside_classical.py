@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from covocp.base.errors import CovocpError, Interrupted, warn_user, without_warn
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
+from covocp.extremal.extremal import Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.solution.origin import Classical
 from covocp.solution.solution import Solution
@@ -32,8 +34,15 @@ WORSE = 1e-6
 # shorter, and the error is an estimate of the combined design's own.
 STEPS = 10.0
 
-# Values of the parameters -> what the classical design costs, and why there is none.
-Costs = Callable[[Array], tuple[float, str]]
+
+class Deterministic(NamedTuple):
+    """What solves the deterministic problem for values of the parameters.
+
+    costs: what the classical design costs, and why there is none. nominal: the outcome without noise.
+    """
+
+    costs: Callable[[Array], tuple[float, str]]
+    nominal: Callable[[Array], Outcome]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,19 +52,27 @@ class ClassicalDesign:
     Args:
         statement: the problem.
         options: of the mesh.
-        make: for some options, what gives the costs.
+        make: for some options, what solves for it.
     """
 
     statement: Statement
     options: Options
-    make: Callable[[Options], Costs]
+    make: Callable[[Options], Deterministic]
 
     __repr__ = short_repr
 
     @cached
-    def costs(self) -> Costs:
-        """What gives its costs on the mesh."""
+    def solver(self) -> Deterministic:
+        """What solves for it on the mesh."""
         return self.make(self.options)
+
+    def nominal(self, parameters: Array) -> Outcome | None:
+        """Its nominal; None where there is none."""
+        try:
+            with without_warnings():  # they concern another solution
+                return self.solver.nominal(parameters)
+        except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved
+            return None
 
     def beside(
         self, solution: Solution, mesh: Mesh, parameters: Array, go_on: Callable[[Solution], Solution]
@@ -69,9 +86,8 @@ class ClassicalDesign:
             go_on: what makes a solution more exact.
         """
         try:
-            costs = self.costs
             with without_warnings():  # they concern another solution
-                classical, missing = costs(parameters)
+                classical, missing = self.solver.costs(parameters)
                 if left_open(solution, classical):
                     classical = self._on_equal_steps(classical, mesh, parameters)
         except KeyboardInterrupt:
@@ -100,7 +116,7 @@ class ClassicalDesign:
         options = with_substeps(self.options, mesh, mesh.substeps)
         if options.substeps == self.options.substeps:
             return classical
-        cost, missing = self.make(options)(parameters)
+        cost, missing = self.make(options).costs(parameters)
         return classical if missing else max(classical, cost)
 
 

@@ -6,26 +6,44 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_number, column
 from covocp.base.errors import ProblemError, no_option, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct, near
-from covocp.extremal.extremal import Outcome
-from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.base.quadrature import interpolated
+from covocp.extremal.dense_output import between_nodes
+from covocp.extremal.extremal import Extremal, Outcome
+from covocp.extremal.given_controls import (
+    DRIFTED,
+    drift,
+    each_interval,
+    evaluate_controls,
+    evaluation_mesh,
+    with_costates,
+)
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Block, Statement
 from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import INTERVALS, Graded, Mesh, Options, control_places
+from covocp.transcription.shooting import interval_columns
+from covocp.transcription.steps import nominal_interval
 
 # Share of a control by which it may differ before and after a node and not jump.
 ROUNDING = 1e-12
 # Relative difference of two values of a decision that are one.
 SAME_VALUE = 1e-9
+# Miss of the states of a solution by its own steps, all together and relative, with which they are those of a system.
+SAME_PATH = 1e-5
+HELD = (
+    "evaluated along a given nominal, held at its nodes: the plant is too unstable for one run along the controls to "
+    "stay there"
+)
 # Arguments of `evaluate` beside the options of the mesh.
 ARGUMENTS = ("nominal", "truth", "intervals", "parameters")
 
@@ -102,7 +120,48 @@ def run_along(
     given = _started_like(statement, nominal, x0, parameters, linked or {})
     x0, e0 = statement.started(given, parameters, e0)
     check_model(statement, x0, u[:1].ravel(), e0, duration, parameters)
-    return evaluate_controls(statement, mesh, u, duration, parameters, x0)
+    run = evaluate_controls(statement, mesh, u, duration, parameters, x0)
+    states = _left(statement, nominal, run, parameters) if isinstance(nominal, Solution) else None
+    if states is None:
+        return run
+    held = evaluate_controls(statement, each_interval(mesh), u, duration, parameters, x0, states)
+    if not held.converged:
+        return run
+    costates = interpolated(nominal.costates.state, nominal.mesh.nodes, mesh.nodes)
+    return replace(with_costates(held, costates), message=HELD)
+
+
+def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Array) -> Array | None:
+    """The states of a solution at the nodes of a run along its controls, (N + 1, nx), where that left them.
+
+    None where it stayed, and where they are not those of this system from there: what is controlled so is another one.
+    """
+    own, t = nominal.extremal, run.extremal.trajectory
+    alike = _plain(nominal.blocks) == _plain(statement.blocks) and own.mesh.readings.shape[0] == statement.readings
+    if not alike or statement.coupled or nominal.statement is None or t.duration != own.trajectory.duration:
+        return None
+    dense = nominal.stored_dense or between_nodes(own)
+    states = dense.at(own.mesh.placed(run.extremal.mesh.nodes))[:, : statement.nx]
+    if drift(states, run.extremal) <= DRIFTED:
+        return None
+    return states if _is_path(statement, own, t.x[0], parameters) else None
+
+
+def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:
+    """Kinds, names and sizes of states and controls."""
+    return [(b.kind, b.name, b.size) for b in blocks if b.kind in ("state", "control")]
+
+
+def _is_path(statement: Statement, own: Extremal, start: Array, parameters: Array) -> bool:
+    """Whether a trajectory is by its own steps one of a system from a start, that its intervals do not leave."""
+    t, mesh = own.trajectory, own.mesh
+    sizes = np.maximum(np.abs(t.x).max(axis=0), np.finfo(float).tiny)
+    advance = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)
+    intervals = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(parameters))
+    ends = np.asarray(advance(t.x[:-1].T, *intervals)[0].full()).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        missed = np.abs(start - t.x[0]) + np.abs(ends - t.x[1:]).sum(axis=0)
+    return bool((missed <= SAME_PATH * sizes).all())
 
 
 def _started_like(

@@ -99,6 +99,17 @@ def by_other_ways(
     return (with_stats(failed, **{OTHERWISE: " and ".join(tried)}) if tried else failed), None
 
 
+def other_covariances(statement: Statement, options: Options, mesh: Mesh) -> str:
+    """A line for a run that failed, of the formulation of the covariances that it did not take; "" where none is open.
+
+    Whether they are variables is chosen by their size; what a run finds no way to in one it may find in the other.
+    """
+    if options.covariances != "auto" or not statement.riccati_forms or not statement.matrices:
+        return ""
+    other = "states" if mesh.eliminated else "eliminated"
+    return f"\n  covariances='{other}' may find a way: this run took '{'eliminated' if mesh.eliminated else 'states'}'."
+
+
 def told_ways(tried: str, left: Iterable[Way]) -> str:
     """A line for a run that failed: what was tried in vain, or what may find a way; "" where there is nothing.
 

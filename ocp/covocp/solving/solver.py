@@ -29,7 +29,7 @@ from covocp.solving import refining
 from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
-from covocp.solving.beside_classical import ClassicalDesign, Costs
+from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.continued import again_on, continued
@@ -39,6 +39,8 @@ from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
+from covocp.solving.from_classical import PATIENCE as SOON
+from covocp.solving.from_classical import from_classical, impatient, patiently
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
 from covocp.solving.held_duration import off_the_limit
@@ -46,7 +48,7 @@ from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
-from covocp.solving.other_ways import Way, other_ways, told_ways
+from covocp.solving.other_ways import Way, other_covariances, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
@@ -130,6 +132,7 @@ class Solver:
         self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = self._ran = False  # at the steps along the guess; from a start
+        self._last: tuple[Array, Outcome] | None = None  # values, and what came of them by itself
         self._borne: Beginning | None = None  # what the nodes are known to be graded for
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
@@ -138,6 +141,10 @@ class Solver:
         self._otherwise = bool(self._best) and self._by_ipopt and "max_iterations" not in self._own
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
+        whole = nominal == "combined" and self._by_ipopt and refine is None
+        self._patient: dict[str, Any] = {}  # options of a run that is not given up soon
+        if whole and impatient(self.statement, self._own):
+            self._own, self._patient = {**self._own, "max_iterations": SOON}, {"max_iterations": None}
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = self._ready(self._options)
@@ -255,8 +262,8 @@ class Solver:
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
-            if self.nominal == "deterministic":
-                outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
+                if self.nominal == "deterministic":
+                    outcome = self._closed(outcome, values, reporter)
             if reporter.asked:
                 raise interrupted(Solution.of(outcome, self._by))
             outcome = with_gain_told(self._problem, outcome, first)
@@ -300,10 +307,22 @@ class Solver:
         ready, where = partial(self._ready, self._options), (values, reporter, start)
         outcome, prepared = in_larger_units(ready, self._prepared, outcome, *where, first=not self._ran)
         self._ran = True
+        if not outcome.converged:
+            outcome, prepared = self._from_classical(outcome, prepared, values, reporter)
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         outcome = off_the_limit(ready, self._prepared, outcome, *where)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
+
+    def _from_classical(
+        self, failed: Outcome, prepared: Prepared, values: Array, reporter: Progress
+    ) -> tuple[Outcome, Prepared]:
+        """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on."""
+        if self.nominal != "combined" or not self.statement.behind:
+            return failed, prepared
+        ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
+        outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)
+        return patiently(outcome, prepared, ready, values, reporter) if self._patient else (outcome, prepared)
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
@@ -429,7 +448,7 @@ class Solver:
 
     def _classical_design(self) -> ClassicalDesign:
         """The classical design on the present mesh."""
-        make = partial(_classical_costs, self._problem)
+        make = partial(_deterministic, self._problem)
         return ClassicalDesign(statement=self.statement, options=self._options, make=make)
 
     def _continued(self, values: Array, solution: Solution) -> Solution:
@@ -438,13 +457,23 @@ class Solver:
         again = partial(self._ready, self._options, tolerance=CONTINUED * tolerance)
         return continued(again, self._solved, values, solution, self._by)
 
+    def _nominal_of_values(self, values: Array) -> Outcome:
+        """The outcome without what is looked at after a run, for stacked parameters; the last one is remembered."""
+        with evaluating(self.statement.name), Progress("", show=False) as reporter:
+            if self._last is None or not np.array_equal(self._last[0], values):
+                self._suit(values, nodes=False)
+                guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
+                self._last = values, from_starts(self._prepared, values, guesses, reporter)[0]
+            if reporter.stop:
+                self._last = None
+                raise KeyboardInterrupt
+            return self._last[1]
+
     def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
+        outcome = self._nominal_of_values(values)
         with evaluating(self.statement.name), Progress("", show=False) as reporter:
-            self._suit(values, nodes=False)
-            guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
-            outcome, _ = from_starts(self._prepared, values, guesses, reporter)
-            outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
+            outcome = self._closed(outcome, values, reporter)
             if reporter.stop:
                 raise KeyboardInterrupt
         if outcome.converged:
@@ -469,15 +498,25 @@ class Solver:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
             finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
-            if finer is None:
+            again = None if finer is None else self._again_by(finer, outcome, values, reporter)
+            if again is None:
                 break
-            found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
-            if found is None:
-                break
-            again, prepared = found
-            outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
-            self._keep(finer, prepared)
+            outcome = again
         return outcome
+
+    def _again_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
+        """An outcome by shorter steps, which later runs take then; None where that fails."""
+        found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
+        if found is None:
+            return None
+        again, prepared = found
+        self._keep(finer, prepared)
+        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
+
+    def _closed(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """Filter and feedback around the nominal of the deterministic cost."""
+        again = partial(self._again_by, outcome=outcome, values=values, reporter=reporter)
+        return closed_around(outcome, self.statement, self._options, own_steps=self._own_steps, again=again)
 
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
@@ -507,11 +546,13 @@ class Solver:
         if not self._by_ipopt or beyond(self._problem.declarations, best):
             return ""
         if self.method == "ipopt" and is_suited(self._solved, self._prepared.mesh):
-            return OTHER_WAY
-        return told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
+            return OTHER_WAY + other_covariances(self._solved, self._options, self._prepared.mesh)
+        told = told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
+        return told or other_covariances(self._solved, self._options, self._prepared.mesh)
 
 
-def _classical_costs(problem: Problem, options: Options) -> Costs:
-    """What gives the cost of the classical design for values of the parameters, on the mesh of some options."""
+def _deterministic(problem: Problem, options: Options) -> Deterministic:
+    """What solves for the classical design, on the mesh of some options."""
     mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
-    return Solver(problem, "ipopt", nominal="deterministic", **mesh)._cost_of_values
+    solver = Solver(problem, "ipopt", nominal="deterministic", **mesh)
+    return Deterministic(costs=solver._cost_of_values, nominal=solver._nominal_of_values)
