@@ -19,20 +19,19 @@ from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluation_mesh
-from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
+from covocp.extremal.mesh_error import OPTIMISED, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
 from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving import refining
-from covocp.solving.around_nominal import closed_around
-from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, mention_left, with_stats
+from covocp.solving.attempts import best_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
+from covocp.solving.classical_runs import ClassicalRuns
 from covocp.solving.coarse_start import from_coarser
-from covocp.solving.continued import again_on, continued
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
@@ -40,7 +39,7 @@ from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.from_classical import PATIENCE as SOON
-from covocp.solving.from_classical import from_classical, impatient, patiently
+from covocp.solving.from_classical import impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
 from covocp.solving.held_duration import off_the_limit
@@ -63,9 +62,6 @@ from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_substeps
 from covocp.transcription.starts import own_start
 
-# Before a solution is called spurious, the run goes on from it with this share of its tolerance, or of the usual one.
-CONTINUED = 1e-3
-TOLERANCE = 1e-7
 OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
 # Times of the runs of a solution [s], and of what else was waited for: runs that lead to its start, what is looked at.
 RUN_SECONDS, OTHER_SECONDS = ("build_seconds", "solve_seconds"), "other_seconds"
@@ -74,7 +70,7 @@ LARGE = 16
 
 
 @methods_one_at_a_time
-class Solver:
+class Solver(ClassicalRuns):
     """A problem made ready for one method: built once, solved again with new parameters and guesses.
 
     Args:
@@ -314,16 +310,6 @@ class Solver:
         outcome = off_the_limit(ready, self._prepared, outcome, *where)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
-    def _from_classical(
-        self, failed: Outcome, prepared: Prepared, values: Array, reporter: Progress
-    ) -> tuple[Outcome, Prepared]:
-        """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on."""
-        if self.nominal != "combined" or not self.statement.behind:
-            return failed, prepared
-        ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
-        outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)
-        return patiently(outcome, prepared, ready, values, reporter) if self._patient else (outcome, prepared)
-
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
     ) -> tuple[Outcome, Guess]:
@@ -439,46 +425,10 @@ class Solver:
         self._keep(replace(self._options, **way.mesh), prepared)
         self._first = (self._options, prepared) if self._remade else (replace(self._first[0], **way.mesh), prepared)
 
-    def _beside_classical(self, solution: Solution, values: Array) -> Solution:
-        """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
-        if self.nominal != "combined" or not self.statement.behind or not solution.converged:
-            return solution
-        given = values[: self.statement.np]
-        return self._classical.beside(solution, self._prepared.mesh, given, partial(self._continued, given))
-
     def _classical_design(self) -> ClassicalDesign:
         """The classical design on the present mesh."""
         make = partial(_deterministic, self._problem)
         return ClassicalDesign(statement=self.statement, options=self._options, make=make)
-
-    def _continued(self, values: Array, solution: Solution) -> Solution:
-        """The solution after going on from it with a smaller tolerance, where that makes it better."""
-        tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
-        again = partial(self._ready, self._options, tolerance=CONTINUED * tolerance)
-        return continued(again, self._solved, values, solution, self._by)
-
-    def _nominal_of_values(self, values: Array) -> Outcome:
-        """The outcome without what is looked at after a run, for stacked parameters; the last one is remembered."""
-        with evaluating(self.statement.name), Progress("", show=False) as reporter:
-            if self._last is None or not np.array_equal(self._last[0], values):
-                self._suit(values, nodes=False)
-                guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
-                self._last = values, from_starts(self._prepared, values, guesses, reporter)[0]
-            if reporter.stop:
-                self._last = None
-                raise KeyboardInterrupt
-            return self._last[1]
-
-    def _cost_of_values(self, values: Array) -> tuple[float, str]:
-        """Cost of the classical design for stacked parameters, and why there is none."""
-        outcome = self._nominal_of_values(values)
-        with evaluating(self.statement.name), Progress("", show=False) as reporter:
-            outcome = self._closed(outcome, values, reporter)
-            if reporter.stop:
-                raise KeyboardInterrupt
-        if outcome.converged:
-            return cost_of(outcome), ""
-        return np.nan, f"The problem without noise was not solved: {outcome.message}."
 
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
@@ -493,30 +443,6 @@ class Solver:
         """Other steps from now on; what the classical design costs is then another number."""
         self._options, self._prepared = options, prepared
         self._classical = self._classical_design()
-
-    def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
-        while self._own_steps and outcome.converged and not reporter.stop:
-            finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
-            again = None if finer is None else self._again_by(finer, outcome, values, reporter)
-            if again is None:
-                break
-            outcome = again
-        return outcome
-
-    def _again_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
-        """An outcome by shorter steps, which later runs take then; None where that fails."""
-        found = again_on(partial(self._ready, finer), self._solved, values, outcome, self._by, reporter)
-        if found is None:
-            return None
-        again, prepared = found
-        self._keep(finer, prepared)
-        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
-
-    def _closed(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Filter and feedback around the nominal of the deterministic cost."""
-        again = partial(self._again_by, outcome=outcome, values=values, reporter=reporter)
-        return closed_around(outcome, self.statement, self._options, own_steps=self._own_steps, again=again)
 
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
