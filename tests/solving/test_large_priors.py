@@ -84,3 +84,26 @@ def test_a_point_that_was_reached_is_not_judged_in_units_of_its_prior(moderate):
     still = replace(found.trajectory, x=0.0 * found.trajectory.x)
     resting = lag(0.01, None).statement()
     assert magnitudes(resting, still, resting.values, reached=True).x == pytest.approx([0.1])
+
+
+@pytest.mark.parametrize(("prior", "intervals"), [(1.0, 30), (1e4, 15), (1e8, 30)])
+def test_what_remains_of_a_prior_is_known_by_itself(prior, intervals):
+    """Of the range of a variance what is left at the end may be nothing: it had been 0.3 % off by default steps."""
+    ocp = co.Problem(10.0)
+    x = ocp.state("x", initial=0.0, final=1.0, variance=prior)
+    v = ocp.state("v", initial=0.0, variance=prior)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, -4 * x - 0.2 * v + u, noise=1e-3)
+    ocp.measurement("m", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * u**2 + 1e3, terminal=E[x, x])  # whose mesh error is small
+    F, Q = np.array([[0.0, 1.0], [-4.0, -0.2]]), np.diag([0.0, 1e-3])
+
+    def rate(t, y):
+        P = y.reshape(2, 2)
+        return (F @ P + P @ F.T + Q - np.outer(P[:, 0], P[:, 0]) / 0.1).ravel()
+
+    run = solve_ivp(rate, (0, 10), (prior * np.eye(2)).ravel(), method="Radau", rtol=1e-10, atol=1e-14)
+    found = co.solve(ocp, intervals=intervals, progress=False)
+    np.testing.assert_allclose(np.diag(found["E"][-1]), run.y[[0, 3], -1], rtol=2e-3)

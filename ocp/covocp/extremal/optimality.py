@@ -71,7 +71,7 @@ class Optimality:
         transversality: k_T + H(T) with all multipliers, relative to the largest terms of H; None for a fixed duration.
         mesh_error: relative change of the cost by halving the integration steps.
         node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
-            relative to its range.
+            relative to its range, at the end of a covariance to its own deviations.
         control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; of
             controls in which H is not convex, int of what H is above its least value with the controls beside (nan of
             one constant control without bounds); where a condition along the path or the bound of a state acts, the
