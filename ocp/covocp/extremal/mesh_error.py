@@ -13,6 +13,7 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.cost_sizes import cancelled_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.final_deviations import final_deviations
 from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
 from covocp.extremal.open_loop import Departure, departure, matrices_along_controls, nominal_along
@@ -61,8 +62,6 @@ PRIMES = (7, 13, 31, 61)
 ROUND = 10
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
-# Share of its largest value below which a variance at the end is zero.
-LEAST_SHARE = 1e-12
 
 
 def mesh_error(extremal: Extremal, running: float, within: Within | None = None) -> float:
@@ -279,26 +278,9 @@ def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tup
         moved, inside = np.cumsum(finer.jumps - gaps, axis=0), np.hstack([finer.states, finer.matrices]) - values
         total = np.abs(inside).max(axis=0)
         total[: moved.shape[1]] += np.abs(moved).max(axis=0)
-        left = np.abs(inside[-1, t.x.shape[1] :]) / _deviations(extremal.statement, t.e)
+        left = np.abs(inside[-1, t.x.shape[1] :]) / final_deviations(extremal.statement, t.e)
         total[t.x.shape[1] :] = np.maximum(total[t.x.shape[1] :], left * size[t.x.shape[1] :])
     return total, size
-
-
-def _deviations(statement: Statement, e: Array) -> Array:
-    """Products of the deviations at the end to which entries of covariances belong, (ne,); inf of other matrices.
-
-    What is told of the end is what remains of a prior that may be a million times as large: of its range it is nothing.
-    """
-    result = np.full(statement.ne, np.inf)
-    for block in statement.matrices:
-        if not block.covariance or block.span.start in statement.entries(statement.behind):
-            continue
-        rows, columns = np.triu_indices(block.size)  # the lower triangle column by column
-        diagonal = rows == columns
-        variances = np.abs(e[:, block.span][:, diagonal])
-        own = np.sqrt(np.maximum(variances[-1], LEAST_SHARE * variances.max(axis=0)))
-        result[block.span] = np.where(own[rows] * own[columns] > 0.0, own[rows] * own[columns], np.inf)
-    return result
 
 
 def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
