@@ -29,9 +29,9 @@ TRIED = 4
 APART = 0.05
 # A rival costs what it was thought to, up to this share.
 TOLD = 0.01
-# Starts that are bent to other sides: those that cost more than the cheapest by more than this share lead to no cheaper
-# minimum (of 300 random identifications none did), and those that cost the same up to this share are its mirror image.
-DEARER, SAME, MOST_SIDES = 0.25, 1e-9, 3
+# Starts that are bent to other sides: so many are run at most. Those that cost and learn the same up to this share are
+# mirror images.
+MOST_SIDES, SAME = 3, 1e-9
 # Places on the way from where a rival begins to what was found at which the cost is looked at.
 ALONG = (0.0, 1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)
 # A violation of conditions that is little, in units of their rows.
@@ -71,13 +71,13 @@ def from_starts(
         if not more or reporter.stop or runs.trusted:
             break
     outcome, start = runs.best()
-    if own is not None and own.sides and start.alike and outcome.converged:
+    if own is not None and own.sides and start.alike and outcome.converged and not reporter.stop:
         _LED[prepared] = own.sides, start
     return outcome, start
 
 
 def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
-    """The start, and those bent to other sides, that are worth a run: the cheapest first, then its rivals.
+    """The start, and those bent to other sides, that are worth a run: the best first, then its rivals.
 
     Where the same were compared before, the one that has led to the best: so it does again.
     """
@@ -96,15 +96,14 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
 def worth_a_run(merits: Sequence[tuple[Merit, Start]]) -> list[Start]:
     """Of starts with their merits, the problem's own first, those that are worth a run: the best first.
 
-    Where they violate conditions by more than a little, what they cost as they begin leaves none out.
+    The own one is always among them, its mirror images never.
     """
     own = merits[0]
     if not np.isfinite(own[0]).all():
         return [own[1]]
     finite = [entry for entry in merits if np.isfinite(entry[0]).all()]
     little = max(merit.violation for merit, _ in finite) <= LITTLE
-    least = min(merit.cost for merit, _ in finite)
-    size = abs(least)
+    size = max(abs(merit.cost) for merit, _ in finite)
 
     def order(entry: tuple[Merit, Start]) -> tuple[float, float]:
         before = SAME * (entry is own)  # its mirror image
@@ -115,11 +114,13 @@ def worth_a_run(merits: Sequence[tuple[Merit, Start]]) -> list[Start]:
         return abs(one.cost - other.cost) <= 2.0 * SAME * size and conditions <= 2.0 * SAME
 
     found: list[tuple[Merit, Start]] = []
-    for merit, start in sorted(finite, key=order):
-        near = not little or merit.cost - least <= DEARER * size
-        if near and len(found) < MOST_SIDES and not any(alike(merit, other) for other, _ in found):
-            found.append((merit, start))
-    return [start for _, start in found]
+    for entry in sorted(finite, key=order):
+        if not any(alike(entry[0], other) for other, _ in found):
+            found.append(entry)
+    kept = found[:MOST_SIDES]
+    if all(entry is not own for entry in kept):
+        kept[-1] = own
+    return [start for _, start in kept]
 
 
 def _as_told(outcome: Outcome, rival: Guess) -> bool:
@@ -186,7 +187,10 @@ class _Runs:
                 self.trusted |= outcome is not None and outcome.converged and _as_told(outcome, rival)
 
     def _falls_to_best(self, rival: Guess) -> bool:
-        """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley."""
+        """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley.
+
+        Nothing is known of that where conditions are violated on the way: they may lie between two valleys.
+        """
         found = [outcome for outcome, _ in self.tried if outcome.converged]
         if not found:
             return False
@@ -194,7 +198,8 @@ class _Runs:
         end, begins = best.extremal.trajectory, rival.trajectory
         merits = [self.prepared.merit(self.values, between(begins, end, share)) for share in ALONG]
         costs = [*(merit.cost for merit in merits), cost_of(best)]
-        return bool(np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())
+        met = max(merit.violation for merit in merits) <= LITTLE
+        return bool(met and np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())
 
     def _led(self, rival: Guess) -> Outcome | None:
         """A run that has come about to where a rival begins."""

@@ -32,7 +32,7 @@ from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.grading import graded
 from covocp.transcription.halved_steps import refined_run
 from covocp.transcription.mesh import Mesh, Options
-from covocp.transcription.mirrored import COMBINED
+from covocp.transcription.mirrored import COMBINED, conditions_on_matrices
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Trajectory
 
@@ -47,7 +47,7 @@ class Begun:
     """Where a method starts: a guess for each phase, parameters with what passes, graded options, statements.
 
     covariances: whether what each phase ends with is a covariance where it should be; else the nearest one is passed.
-    cost: of all phases along the guesses, where it was asked for.
+    merit: of all phases along the guesses, where it was asked for.
     """
 
     chain: Chain
@@ -55,7 +55,7 @@ class Begun:
     values: Arrays
     options: tuple[Options, ...]
     covariances: bool
-    cost: float = np.nan
+    merit: Merit | None = None
 
     __repr__ = short_repr
 
@@ -211,19 +211,24 @@ class ChainRuns:
 
     def _sides(self, begun: Begun) -> list[Guesses]:
         """The start, and those whose phases are bent to other sides, that are worth a run beside it."""
-        own, count = begun.guesses, len(begun.guesses)
-        if not any(guess.sides for guess in own):
-            return [own]
-        patterns = product((False, True), repeat=count) if count <= COMBINED else [(False,) * count, (True,) * count]
-        costs = []
+        own = begun.guesses
+        sided = [i for i, guess in enumerate(own) if guess.sides]
+        signs = product((False, True), repeat=len(sided)) if len(sided) <= COMBINED else [()]
+        patterns = [{i for i, sign in zip(sided, each, strict=True) if sign} for each in signs if each]
+        patterns = patterns or ([set(), set(sided)] if sided else [])
+        merits = []
         for turned in patterns:
             try:
                 found = self._begun(begun.options, turned=turned)
             except OutsideDomainError:
+                if not turned:
+                    return [own]
                 continue
-            costs.append((Merit(found.cost, 0.0, 0.0), found.guesses if any(turned) else own))
+            assert found.merit is not None
+            merits.append((found.merit, found.guesses if turned else own))
         # phases that begin alone know nothing of one another: what they cost tells less than of one problem
-        return [own, *(guesses for guesses in worth_a_run(costs) if guesses is not own)]
+        others = [guesses for guesses in worth_a_run(merits) if guesses is not own] if merits else []
+        return [own, *others]
 
     def _unwound(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
         """Solved again without the turns that angles make between nodes, where that works and is cheaper."""
@@ -265,21 +270,21 @@ class ChainRuns:
             return None
         return None if found is None else found.guesses
 
-    def _begun(self, options: tuple[Options, ...], attempt: int = 0, turned: tuple[bool, ...] = ()) -> Begun:
+    def _begun(self, options: tuple[Options, ...], attempt: int = 0, turned: set[int] | None = None) -> Begun:
         """A guess for each phase, each of which starts where the one before it ends.
 
         The parameters have the matrices that a phase then starts with, and the weights that the next one has where it
-        begins; the options are graded for them. `turned`: the phases that are bent to the other side; then what they
-        cost is asked for, along starts as they are to be compared.
+        begins; the options are graded for them. `turned`: the phases that are bent to the other side; then their merit
+        is asked for, along starts as they are to be compared.
         """
 
         def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess:
             guesses = first_guesses(own, st, mesh, value, self._guesses[i], linked=True)
             guess = list(islice(guesses, attempt + 1))[-1]
-            if not turned:
+            if turned is None:
                 return guess
             sides = guess.sides or (guess.trajectory,)
-            trajectory, costs[i] = _along(st, mesh, sides[-1 if turned[i] else 0], value)
+            trajectory, costs[i] = _along(st, mesh, sides[-1 if i in turned else 0], value)
             return Guess(trajectory=trajectory)
 
         costs: dict[int, float] = {}
@@ -287,7 +292,11 @@ class ChainRuns:
         if found is not None and any(link.weights for link in self._chain.links):
             found = self._forward(options, self._weighed(found), made)
         assert found is not None
-        return replace(found, cost=sum(costs.values())) if turned else found
+        if turned is None:
+            return found
+        known = sum(float(np.abs(guess.trajectory.e[-1]).sum()) for guess in found.guesses)
+        limited = any(conditions_on_matrices(st) for st in found.chain.statements)  # what they violate is not known
+        return replace(found, merit=Merit(sum(costs.values()), float(limited), known))
 
     def _weighed(self, begun: Begun) -> Arrays:
         """The parameters with S of each later phase along its guess, where it begins; from the last to the first."""

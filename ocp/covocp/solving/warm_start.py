@@ -60,7 +60,7 @@ def make_guesses(
     elif isinstance(guess, Solution):
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
-        for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
+        for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters, linked=linked):
             yield Guess(
                 trajectory=first.trajectory, held=first.held, rival=first.rival, about=first.about, sides=first.sides
             )

@@ -20,25 +20,33 @@ from covocp.transcription.steering import steer
 from covocp.transcription.trajectory import Trajectory
 
 # Controls of which all combinations of signs are made; of more than these each is turned alone, and all together.
-COMBINED = 3
+COMBINED = 4
 
 
-def other_sides(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Trajectory, ...]:
-    """The problem's own start as it is to be compared with those that are bent to other sides, and these.
+def other_sides(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool) -> tuple[Trajectory, ...]:
+    """Starts whose controls are bent to other sides, brought to the final values.
 
     The last ones are kept, as those of `own_start`.
 
+    Args:
+        statement: the problem.
+        mesh: of it.
+        parameters: values (np,).
+        linked: whether other phases may pay for what is learnt.
+
     Returns:
-        None where what is learnt does not depend on the side, or the start is not one that was bent.
+        The problem's own start as it is to be compared with them, and they, last all controls to the other side; none
+        where what is learnt does not depend on the side, or the start was not bent.
     """
-    return (_other_sides if stays(statement) else _other_sides.__wrapped__)(statement, mesh, tuple(parameters))
+    found = _other_sides if stays(statement) else _other_sides.__wrapped__
+    return found(statement, mesh, tuple(parameters), linked)
 
 
 @lru_cache(maxsize=2)
-def _other_sides(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> tuple[Trajectory, ...]:
+def _other_sides(statement: Statement, mesh: Mesh, values: tuple[float, ...], linked: bool) -> tuple[Trajectory, ...]:
     parameters = np.array(values)
     own = own_start(statement, mesh, parameters)
-    if own.unbent is None or own.held or not own.plain or not _learns(statement):
+    if own.unbent is None or own.held or not own.plain or not _learns(statement, linked):
         return ()
     bend = own.trajectory.u - own.unbent
     if not np.isfinite(own.trajectory.x).all() or not bend.any():
@@ -55,17 +63,22 @@ def _other_sides(statement: Statement, mesh: Mesh, values: tuple[float, ...]) ->
     return (first, *(brought(own.unbent + signs * bend) for signs in _signs(bend)))
 
 
-def _learns(statement: Statement) -> bool:
-    """Whether the cost or a condition depends on matrices, and these on how the nominal moves."""
+def _learns(statement: Statement, linked: bool) -> bool:
+    """Whether cost or conditions, of others too where it is linked, read matrices, and these depend on the nominal."""
     if not statement.matrices or statement.coupled:
         return False
-    paid = statement.running_uses_matrices or statement.terminal.jac_sparsity(0, 1).nnz()
-    if not paid and not any(c.size and c.function.jac_sparsity(0, 2).nnz() for c in statement.conditions):
+    paid = linked or statement.running_uses_matrices or statement.terminal.jac_sparsity(0, 1).nnz()
+    if not paid and not conditions_on_matrices(statement):
         return False
     if any(statement.varies(i) for i in range(len(statement.matrices))):
         return True
     samples = statement.samples
     return samples is not None and any(samples.measurement.jac_sparsity(k, i).nnz() for k in (1, 2) for i in (0, 1))
+
+
+def conditions_on_matrices(statement: Statement) -> bool:
+    """Whether some inequality reads a matrix."""
+    return any(c.size and c.function.jac_sparsity(0, 2).nnz() for c in statement.conditions)
 
 
 def _signs(bend: Array) -> Iterator[Array]:
@@ -75,7 +88,7 @@ def _signs(bend: Array) -> Iterator[Array]:
     if bent.size <= COMBINED:
         patterns = [np.array(p) for p in product((1.0, -1.0), repeat=bent.size)][1:]
     else:
-        patterns = [-np.ones(bent.size), *(1.0 - 2.0 * row for row in np.eye(bent.size))]
+        patterns = [*(1.0 - 2.0 * row for row in np.eye(bent.size)), -np.ones(bent.size)]
     for pattern in patterns:
         signs[bent] = pattern
         yield signs.copy()

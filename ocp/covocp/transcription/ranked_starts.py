@@ -45,10 +45,11 @@ DETOURS = 40
 SHARES, KEPT_BEND = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), 1 / 16
 
 
-def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
+def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool = False) -> Iterator[First]:
     """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
 
     Before them come the ways round what they run through, the cheapest first: rivals of what comes of the others.
+    `linked`: one of several phases.
 
     Raises:
         ProblemError: where a rate is NaN or inf at the start (says which).
@@ -57,7 +58,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Firs
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
         yield from _ways(statement, mesh, parameters, own, []) if free else []
-        yield replace(own, sides=other_sides(statement, mesh, parameters)) if free else own
+        yield replace(own, sides=other_sides(statement, mesh, parameters, linked=linked)) if free else own
         if own.held:
             yield own_start(statement, mesh, parameters, hold=False)
         if free:
