@@ -54,6 +54,7 @@ from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.mirrored import conditions_on_matrices
 from covocp.transcription.nlp import check_costs
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Trajectory
@@ -294,8 +295,9 @@ class GradientSolver:
         with np.errstate(all="ignore"):
             iterate = self.space(parameters, guess).first(guess)
         excess = max((float(np.max(own, initial=0.0)) for own in iterate.penalty.excess), default=0.0)
-        last = iterate.run.z[-1, self._statement.nx :]  # covariances
-        return Merit(float(iterate.run.cost), excess, float(np.abs(last).sum()))
+        last = iterate.run.z[-1, self._statement.nx :]  # covariances, which count where conditions read them
+        known = float(np.abs(last).sum()) if conditions_on_matrices(self._statement) else 0.0
+        return Merit(float(iterate.run.cost), excess, known)
 
     def space(self, parameters: Array, guess: Guess) -> Space:
         """The unknowns of the method for these parameters, with the compiled sweeps."""

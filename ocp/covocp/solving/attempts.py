@@ -30,8 +30,8 @@ APART = 0.05
 # A rival costs what it was thought to, up to this share.
 TOLD = 0.01
 # Starts that are bent to other sides: so many are run at most. Those that cost and learn the same up to this share are
-# mirror images.
-MOST_SIDES, SAME = 3, 1e-9
+# mirror images. A rival counts where it is cheaper by more than the last share.
+MOST_SIDES, SAME, CHEAPER = 2, 1e-9, 1e-7
 # Places on the way from where a rival begins to what was found at which the cost is looked at.
 ALONG = (0.0, 1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)
 # A violation of conditions that is little, in units of their rows.
@@ -61,8 +61,7 @@ def from_starts(
     own = next(others, None)
     if own is not None:
         first, *beside = _sides(prepared, values, own) if own.sides else [own]
-        turned = first.trajectory is not own.trajectory
-        rivals, others = [*beside, *rivals], chain([first, own] if turned else [first], others)
+        rivals, others = [*beside, *rivals], chain([first], others)
     for count in range(TRIED):
         guess = next(others, None)
         more = guess is not None and runs.goes_on(guess)
@@ -77,7 +76,7 @@ def from_starts(
 
 
 def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
-    """The start, and those bent to other sides, that are worth a run: the best first, then its rivals.
+    """The start, then those bent to other sides that are worth a run, its rivals.
 
     Where the same were compared before, the one that has led to the best: so it does again.
     """
@@ -87,40 +86,30 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
     first, *mirrored = own.sides
     alone = prepared.merit(values, own.trajectory)  # first: its magnitudes are those of the program
     alone = alone if first is own.trajectory else prepared.merit(values, first)
-    merits = [(alone, replace(own, alike=True))]
-    merits += [(prepared.merit(values, t), Guess(trajectory=t, alike=True)) for t in mirrored]
-    found, *beside = worth_a_run(merits)
-    return [found, *(replace(guess, rival=True) for guess in beside)]
+    merits = [(prepared.merit(values, t), Guess(trajectory=t, alike=True, rival=True)) for t in mirrored]
+    return [replace(own, alike=True), *worth_a_run(alone, merits)]
 
 
-def worth_a_run(merits: Sequence[tuple[Merit, Start]]) -> list[Start]:
-    """Of starts with their merits, the problem's own first, those that are worth a run: the best first.
+def worth_a_run(own: Merit, others: Sequence[tuple[Merit, Start]]) -> list[Start]:
+    """Of other starts with their merits those that are worth a run beside the problem's own one: the best first.
 
-    The own one is always among them, its mirror images never.
+    Mirror images of that, and of one another, are not.
     """
-    own = merits[0]
-    if not np.isfinite(own[0]).all():
-        return [own[1]]
-    finite = [entry for entry in merits if np.isfinite(entry[0]).all()]
-    little = max(merit.violation for merit, _ in finite) <= LITTLE
-    size = max(abs(merit.cost) for merit, _ in finite)
-
-    def order(entry: tuple[Merit, Start]) -> tuple[float, float]:
-        before = SAME * (entry is own)  # its mirror image
-        return 0.0 if little else entry[0].violation - before, entry[0].cost - before * size
+    if not np.isfinite(own).all():
+        return []
+    finite = [entry for entry in others if np.isfinite(entry[0]).all()]
+    little = max([own.violation, *(merit.violation for merit, _ in finite)]) <= LITTLE
+    size = max([abs(own.cost), *(abs(merit.cost) for merit, _ in finite)])
 
     def alike(one: Merit, other: Merit) -> bool:
         conditions = max(abs(one.violation - other.violation), abs(one.mark - other.mark) / max(1.0, abs(one.mark)))
-        return abs(one.cost - other.cost) <= 2.0 * SAME * size and conditions <= 2.0 * SAME
+        return abs(one.cost - other.cost) <= SAME * size and conditions <= SAME
 
     found: list[tuple[Merit, Start]] = []
-    for entry in sorted(finite, key=order):
-        if not any(alike(entry[0], other) for other, _ in found):
-            found.append(entry)
-    kept = found[:MOST_SIDES]
-    if all(entry is not own for entry in kept):
-        kept[-1] = own
-    return [start for _, start in kept]
+    for merit, start in sorted(finite, key=lambda entry: (0.0 if little else entry[0].violation, entry[0].cost)):
+        if not any(alike(merit, other) for other in (own, *(kept for kept, _ in found))):
+            found.append((merit, start))
+    return [start for _, start in found[:MOST_SIDES]]
 
 
 def _as_told(outcome: Outcome, rival: Guess) -> bool:
@@ -218,6 +207,8 @@ class _Runs:
         converged = [one for one in self.tried if one[0].converged]
         if any(guess.rival for _, guess in self.tried) and converged:
             outcome, guess = min(converged, key=lambda one: cost_of(one[0]))
+            first, least = cost_of(converged[0][0]), cost_of(outcome)
+            outcome, guess = converged[0] if first - least <= CHEAPER * abs(least) else (outcome, guess)
             return _with_all(outcome, [one for one, _ in self.tried]), guess
         tried = [one for one in self.tried if not one[1].rival] or self.tried
         outcome, guess = tried[-1]

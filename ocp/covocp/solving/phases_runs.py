@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice, product
 from typing import Any
@@ -38,6 +39,7 @@ from covocp.transcription.trajectory import Trajectory
 
 Arrays = tuple[Array, ...]
 Guesses = tuple[Guess, ...]
+NO_MERIT = Merit(np.nan, np.nan, np.nan)
 # Number, statement, options, mesh and parameters of a phase -> where it starts; None where there is no such start.
 Made = Callable[[int, Statement, Options, Mesh, Array], Guess | None]
 
@@ -213,22 +215,15 @@ class ChainRuns:
         """The start, and those whose phases are bent to other sides, that are worth a run beside it."""
         own = begun.guesses
         sided = [i for i, guess in enumerate(own) if guess.sides]
-        signs = product((False, True), repeat=len(sided)) if len(sided) <= COMBINED else [()]
-        patterns = [{i for i, sign in zip(sided, each, strict=True) if sign} for each in signs if each]
-        patterns = patterns or ([set(), set(sided)] if sided else [])
+        signs = product((False, True), repeat=len(sided)) if len(sided) <= COMBINED else [(True,) * len(sided)]
+        patterns = [{i for i, sign in zip(sided, each, strict=True) if sign} for each in signs]
         merits = []
-        for turned in patterns:
-            try:
+        for turned in [set(), *filter(None, patterns)] if sided else []:
+            with suppress(OutsideDomainError):
                 found = self._begun(begun.options, turned=turned)
-            except OutsideDomainError:
-                if not turned:
-                    return [own]
-                continue
-            assert found.merit is not None
-            merits.append((found.merit, found.guesses if turned else own))
-        # phases that begin alone know nothing of one another: what they cost tells less than of one problem
-        others = [guesses for guesses in worth_a_run(merits) if guesses is not own] if merits else []
-        return [own, *others]
+                merits.append((found.merit or NO_MERIT, turned, found.guesses))
+        alone = next((merit for merit, turned, _ in merits if not turned), NO_MERIT)
+        return [own, *worth_a_run(alone, [(merit, guesses) for merit, turned, guesses in merits if turned])]
 
     def _unwound(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
         """Solved again without the turns that angles make between nodes, where that works and is cheaper."""
