@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.solving import solver
 
 
 def cost_of(A, B, W, R, Q, M, E0, end, start, duration):
@@ -114,3 +115,32 @@ def test_a_long_linear_quadratic_problem_has_the_nominal_of_the_deterministic_co
     assert solution.optimised
     assert solution.optimality.stationarity < 1e-5
     assert solution.stats["iterations"] < 200
+
+
+def test_random_starts_have_all_iterations(monkeypatch):
+    """A run that is given up soon is taken up elsewhere, but not the best of several."""
+    monkeypatch.setattr(solver, "SOON", 2)
+    found = co.solve(cart_and_pole(1.0), intervals=20, guess="multistart", starts=1, progress=False)
+    assert found.cost == pytest.approx(cost_of_cart_and_pole(1.0), rel=1e-3)
+
+
+def test_iterations_that_were_asked_for_are_not_exceeded():
+    found = co.solve(cart_and_pole(2.0), intervals=20, max_iterations=2, allow_failure=True, progress=False)
+    assert not found.converged
+    assert found.stats["iterations"] <= 2
+
+
+def test_a_stable_plant_is_not_held_at_the_nodes_of_long_steps():
+    """Other steps leave these as well, which is no instability; by shorter ones the cost is that of the controls."""
+    ocp = co.Problem(20.0)
+    x = ocp.state("x", shape=2, initial=[1.0, 0.0], variance=0.1)
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(-0.1 * x[0] + 3 * x[1], -3 * x[0] - 0.1 * x[1] + u), noise=[0.0, 0.1])
+    ocp.measurement("y", x[0], noise=0.1)
+    ocp.minimize_expected(running=ca.sumsqr(x) + u**2, terminal=ca.sumsqr(x))
+    fine = co.solve(ocp, nominal="deterministic", intervals=20, substeps=32, progress=False)
+    with pytest.warns(co.CovocpWarning, match="too coarse"):
+        classical = co.solve(ocp, nominal="deterministic", intervals=20, substeps=8, progress=False)
+    found = co.evaluate(ocp, nominal=classical, intervals=20)
+    assert found.cost == pytest.approx(fine.cost, rel=5e-5)
+    assert "unstable" not in found.message

@@ -11,7 +11,7 @@ import pytest
 import covocp as co
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome
-from covocp.solving import other_ways, solver
+from covocp.solving import classical_runs, other_ways, solver
 from covocp.solving.other_ways import Way, by_other_ways
 
 INTERVALS = {"intervals": 30, "progress": False}
@@ -169,7 +169,7 @@ def test_a_way_that_raises_leaves_the_run_that_failed(monkeypatch):
 
 
 def test_finer_steps_that_raise_leave_the_solution(monkeypatch):
-    monkeypatch.setattr(solver, "finer_steps", lambda extremal, options, *_: replace(options, substeps=7))
+    monkeypatch.setattr(classical_runs, "finer_steps", lambda extremal, options, *_: replace(options, substeps=7))
     raising(monkeypatch, lambda options, own: options.substeps == 7)
     ocp = co.Problem(1.0)
     x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")

@@ -34,9 +34,9 @@ class Listener:
     def __enter__(self) -> None:
         """Listen from now on."""
         depth = self._depth
-        self._calls.depth = depth + 1
         if depth == 0 and _in_main_thread():
             self._begin()
+        self._calls.depth = depth + 1  # last: a signal before it leaves nothing to be undone
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None

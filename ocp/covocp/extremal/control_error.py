@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked
+from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined, with_parts
@@ -86,6 +87,8 @@ class _Along:
     parts: int
     ends: tuple[Array, Array]
     function: Matrices
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal, parts: int) -> _Along:

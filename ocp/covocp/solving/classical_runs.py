@@ -42,6 +42,7 @@ class ClassicalRuns:
     _classical: ClassicalDesign
     _own_steps: bool
     _patient: dict[str, Any]
+    _asked_for: bool
     _last: tuple[Array, Outcome] | None
 
     def _ready(
@@ -58,8 +59,11 @@ class ClassicalRuns:
     def _from_classical(
         self, failed: Outcome, prepared: Prepared, values: Array, reporter: Progress
     ) -> tuple[Outcome, Prepared]:
-        """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on."""
-        if self.nominal != "combined" or not self.statement.behind:
+        """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on.
+
+        Not where the user asked for fewer iterations, or for more digits, than that would keep to.
+        """
+        if self.nominal != "combined" or not self.statement.behind or self._asked_for:
             return failed, prepared
         ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
         outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)

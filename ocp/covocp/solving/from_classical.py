@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -29,14 +28,14 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers
 
 # Iterations after which a run that creeps is given up where the classical design is the optimum, and soon had.
-PATIENCE = 100
+SOON = 100
 # Multipliers that both problems have; those of the matrices are the problem's own.
 SHARED = ("final", "end", "start", "instants", "path", "states", "controls", "inside_path", "inside_states")
 
 
-def impatient(statement: Statement, own: dict[str, Any]) -> bool:
-    """Whether a run may be given up soon: the optimum is that of a quadratic program, and no more was asked for."""
-    return "max_iterations" not in own and separates(statement) and quadratic(statement)
+def impatient(statement: Statement) -> bool:
+    """Whether a run may be given up soon: the optimum is that of a quadratic program."""
+    return separates(statement) and quadratic(statement)
 
 
 def from_classical(

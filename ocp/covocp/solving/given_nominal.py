@@ -24,6 +24,7 @@ from covocp.extremal.given_controls import (
     evaluation_mesh,
     with_costates,
 )
+from covocp.extremal.mesh_error import unstable
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
@@ -134,7 +135,8 @@ def run_along(
 def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Array) -> Array | None:
     """The states of a solution at the nodes of a run along its controls, (N + 1, nx), where that left them.
 
-    None where it stayed, and where they are not those of this system from there: what is controlled so is another one.
+    None where it stayed, where the plant amplifies nothing (other steps leave it too), and where they are not those of
+    this system from there: what is controlled so is another one.
     """
     own, t = nominal.extremal, run.extremal.trajectory
     alike = _plain(nominal.blocks) == _plain(statement.blocks) and own.mesh.readings.shape[0] == statement.readings
@@ -144,7 +146,7 @@ def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Arr
     states = dense.at(own.mesh.placed(run.extremal.mesh.nodes))[:, : statement.nx]
     if drift(states, run.extremal) <= DRIFTED:
         return None
-    return states if _is_path(statement, own, t.x[0], parameters) else None
+    return states if _is_path(statement, own, t.x[0], parameters) and unstable(own) is not None else None
 
 
 def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:

@@ -30,7 +30,7 @@ from covocp.solving.attempts import best_of, counted, from_starts, interrupted, 
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
-from covocp.solving.classical_runs import ClassicalRuns
+from covocp.solving.classical_runs import TOLERANCE, ClassicalRuns
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -38,8 +38,7 @@ from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
-from covocp.solving.from_classical import PATIENCE as SOON
-from covocp.solving.from_classical import impatient
+from covocp.solving.from_classical import SOON, impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.gain_ways import by_any_way
 from covocp.solving.held_duration import off_the_limit
@@ -138,8 +137,9 @@ class Solver(ClassicalRuns):
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
         whole = nominal == "combined" and self._by_ipopt and refine is None
+        self._asked_for = "max_iterations" in own or (own.get("tolerance") or TOLERANCE) < TOLERANCE
         self._patient: dict[str, Any] = {}  # options of a run that is not given up soon
-        if whole and impatient(self.statement, self._own):
+        if whole and not self._asked_for and impatient(self.statement):
             self._own, self._patient = {**self._own, "max_iterations": SOON}, {"max_iterations": None}
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
@@ -243,10 +243,12 @@ class Solver(ClassicalRuns):
         with evaluating(self.statement.name):
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 if isinstance(guess, str):
-                    here = (self._solved, self._prepared.mesh, values)
-                    alone = partial(from_starts, self._prepared, values, make_guesses(*here, None), reporter)
+                    here, prepared = (self._solved, self._prepared.mesh, values), self._prepared
+                    if self._patient:
+                        prepared = self._ready(self._options, **self._patient)
+                    alone = partial(from_starts, prepared, values, make_guesses(*here, None), reporter)
                     guesses = random_guesses(*here, starts, seed)
-                    outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter, alone), None
+                    outcome, first = best_of(prepared, values, guesses, starts + 1, reporter, alone), None
                     if assess:
                         outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:
