@@ -24,7 +24,7 @@ from covocp.extremal.given_controls import (
     evaluation_mesh,
     with_costates,
 )
-from covocp.extremal.mesh_error import unstable
+from covocp.extremal.mesh_error import UNSTABLE
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
@@ -146,7 +146,10 @@ def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Arr
     states = dense.at(own.mesh.placed(run.extremal.mesh.nodes))[:, : statement.nx]
     if drift(states, run.extremal) <= DRIFTED:
         return None
-    return states if _is_path(statement, own, t.x[0], parameters) and unstable(own) is not None else None
+    amplified = drift(states, run.extremal) > UNSTABLE * float(
+        _defects(statement, run.extremal, states, parameters).sum()
+    )
+    return states if amplified and _is_path(statement, own, t.x[0], parameters) else None
 
 
 def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:
@@ -154,16 +157,22 @@ def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:
     return [(b.kind, b.name, b.size) for b in blocks if b.kind in ("state", "control")]
 
 
-def _is_path(statement: Statement, own: Extremal, start: Array, parameters: Array) -> bool:
-    """Whether a trajectory is by its own steps one of a system from a start, that its intervals do not leave."""
-    t, mesh = own.trajectory, own.mesh
-    sizes = np.maximum(np.abs(t.x).max(axis=0), np.finfo(float).tiny)
+def _defects(statement: Statement, along: Extremal, x: Array, parameters: Array) -> Array:
+    """By how much each interval of a mesh leaves states at its nodes, in magnitudes of these, (N,)."""
+    mesh, t = along.mesh, along.trajectory
+    sizes = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
     advance = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)
     intervals = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(parameters))
-    ends = np.asarray(advance(t.x[:-1].T, *intervals)[0].full()).T
+    ends = np.asarray(advance(x[:-1].T, *intervals)[0].full()).T
     with np.errstate(over="ignore", invalid="ignore"):
-        missed = np.abs(start - t.x[0]) + np.abs(ends - t.x[1:]).sum(axis=0)
-    return bool((missed <= SAME_PATH * sizes).all())
+        return np.asarray((np.abs(ends - x[1:]) / sizes).max(axis=1))
+
+
+def _is_path(statement: Statement, own: Extremal, start: Array, parameters: Array) -> bool:
+    """Whether a trajectory is by its own steps one of a system from a start, that its intervals do not leave."""
+    x = own.trajectory.x
+    apart = (np.abs(start - x[0]) / np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)).max(initial=0.0)
+    return bool(apart + _defects(statement, own, x, parameters).sum() <= SAME_PATH)
 
 
 def _started_like(
