@@ -144,12 +144,13 @@ def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Arr
         return None
     dense = nominal.stored_dense or between_nodes(own)
     states = dense.at(own.mesh.placed(run.extremal.mesh.nodes))[:, : statement.nx]
-    if drift(states, run.extremal) <= DRIFTED:
+    moved = drift(states, run.extremal)
+    if moved <= DRIFTED:
         return None
-    amplified = drift(states, run.extremal) > UNSTABLE * float(
-        _defects(statement, run.extremal, states, parameters).sum()
-    )
-    return states if amplified and _is_path(statement, own, t.x[0], parameters) else None
+    suffered = float(_defects(statement, run.extremal, states, parameters).sum())
+    if moved <= UNSTABLE * suffered or not _is_path(statement, own, t.x[0], parameters):
+        return None
+    return states
 
 
 def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:
