@@ -36,6 +36,7 @@ MOST_SIDES, SAME, CHEAPER = 2, 1e-9, 1e-7
 ALONG = (0.0, 1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)
 # A violation of conditions that is little, in units of their rows.
 LITTLE = 1e-2
+NO_MERIT = Merit(np.nan, np.nan, np.nan)
 # Of a problem made ready: the sides that its last run from them has compared, and from which of them its best came.
 _LED: WeakKeyDictionary[Prepared, tuple[tuple[Trajectory, ...], Guess]] = WeakKeyDictionary()
 
@@ -84,10 +85,18 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
     if sides is own.sides:
         return [replace(led, rival=False)]
     first, *mirrored = own.sides
-    alone = prepared.merit(values, own.trajectory)  # first: its magnitudes are those of the program
-    alone = alone if first is own.trajectory else prepared.merit(values, first)
-    merits = [(prepared.merit(values, t), Guess(trajectory=t, alike=True, rival=True)) for t in mirrored]
+    alone = _merit(prepared, values, own.trajectory)  # first: its magnitudes are those of the program
+    alone = alone if first is own.trajectory else _merit(prepared, values, first)
+    merits = [(_merit(prepared, values, t), Guess(trajectory=t, alike=True, rival=True)) for t in mirrored]
     return [replace(own, alike=True), *worth_a_run(alone, merits)]
+
+
+def _merit(prepared: Prepared, values: Array, trajectory: Trajectory) -> Merit:
+    """Of a trajectory; NaN where the model has no values along it: what runs from there says so."""
+    try:
+        return prepared.merit(values, trajectory)
+    except (OutsideDomainError, RuntimeError, np.linalg.LinAlgError):  # what CasADi raises is a RuntimeError
+        return NO_MERIT
 
 
 def worth_a_run(own: Merit, others: Sequence[tuple[Merit, Start]]) -> list[Start]:
@@ -185,7 +194,7 @@ class _Runs:
             return False
         best = min(found, key=cost_of)
         end, begins = best.extremal.trajectory, rival.trajectory
-        merits = [self.prepared.merit(self.values, between(begins, end, share)) for share in ALONG]
+        merits = [_merit(self.prepared, self.values, between(begins, end, share)) for share in ALONG]
         costs = [*(merit.cost for merit in merits), cost_of(best)]
         met = max(merit.violation for merit in merits) <= LITTLE
         return bool(met and np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())

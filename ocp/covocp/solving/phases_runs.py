@@ -19,7 +19,7 @@ from covocp.extremal.densities import JumpEnds, impossible_jump
 from covocp.extremal.extremal import Guess, Merit
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
-from covocp.solving.attempts import TRIED, best_of, counted, worth_a_run
+from covocp.solving.attempts import NO_MERIT, TRIED, best_of, counted, worth_a_run
 from covocp.solving.other_minima import TURNS, unless_it_fails
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
@@ -39,7 +39,6 @@ from covocp.transcription.trajectory import Trajectory
 
 Arrays = tuple[Array, ...]
 Guesses = tuple[Guess, ...]
-NO_MERIT = Merit(np.nan, np.nan, np.nan)
 # Number, statement, options, mesh and parameters of a phase -> where it starts; None where there is no such start.
 Made = Callable[[int, Statement, Options, Mesh, Array], Guess | None]
 
