@@ -20,8 +20,6 @@ ZERO_COST = 1e-30
 # Least share of its size that counts as variable. Solvers compare costs, whose sums are known to some 1e-13: so much is
 # below a residual of 1e-4 of a tenth of it.
 RESOLVED = 1e-8
-# Share of the size of its terms at all times below which a cost has no unit of its own.
-CANCELLED = 1e-3
 
 
 @lru_cache(maxsize=4)
@@ -31,19 +29,6 @@ def absolute_cost(extremal: Extremal) -> float:
     terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
     running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())[2]
     return abs(terminal) + abs(float(np.trapezoid(running.ravel(), extremal.time)))
-
-
-def cancelled_cost(extremal: Extremal, others: float = 0.0) -> float:
-    """What is left of a cost at least, as its unit, where it is the difference of terms that are much larger.
-
-    Args:
-        extremal: the solution.
-        others: size of the cost of the rest of a chain.
-    """
-    st, t = extremal.statement, extremal.trajectory
-    terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())[2]
-    return CANCELLED * (abs(terminal) + float(np.trapezoid(np.abs(running.ravel()), extremal.time)) + others)
 
 
 @lru_cache(maxsize=KEPT)

@@ -10,7 +10,6 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.cost_sizes import cancelled_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.final_deviations import final_deviations
@@ -82,8 +81,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             later ones, at best and along their controls.
 
     Returns:
-        |change| / max(|changed cost|, what is left of large terms, NO_COST), or the share of the states' ranges; nan
-        where the run is not finite.
+        |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
     st = extremal.statement
     cost = _cost_of_all(extremal, running, within)
@@ -92,8 +90,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
         with np.errstate(over="ignore", invalid="ignore"):
             further = _change(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
-    if (error := _share(change, missed, cost)) > COARSE_MESH:
-        error = _share(change, missed, cost, cancelled_cost(extremal, 0.0 if within is None else within.size))
+    error = _share(change, missed, cost)
     moves = not st.autonomous
     if moves and not np.isfinite(moved):
         return error
@@ -110,9 +107,9 @@ def _cost_of_all(extremal: Extremal, running: float, within: Within | None) -> f
     return cost if within is None else cost + within.others
 
 
-def _share(change: float, missed: float, cost: float, least: float = NO_COST) -> float:
-    """A change of the cost, with or without what is missed at the end, in the changed cost, or the least unit."""
-    return max(abs(change), abs(change - missed)) / max(abs(cost + change), least, NO_COST)
+def _share(change: float, missed: float, cost: float) -> float:
+    """A change of the cost, with or without what is missed at the end, in the changed cost."""
+    return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
 
 
 def _unlike_halves(
