@@ -88,7 +88,7 @@ def test_costates_that_explicit_steps_do_not_reach_are_not_compared():
     ocp.dynamics(x, u, noise=1.0)
     ocp.measurement("position", x, noise=1e-12)
     ocp.minimize(running=u**2 + x**2 + ocp.estimation_covariance()[x, x])
-    with pytest.warns(co.CovocpWarning, match="The mesh is too coarse"):
+    with pytest.warns(co.CovocpWarning, match="The integration steps are long"):
         solution = solve(ocp, intervals=10)
     assert solution.optimality.costate_difference is None
     assert "not checked" in str(solution)

@@ -9,7 +9,7 @@ from problems import lag
 import covocp as co
 from covocp.base.progress import Progress
 from covocp.extremal import curvature
-from covocp.solving import other_minima, phases_runs, solver
+from covocp.solving import classical_runs, other_minima, phases_runs, solver
 from covocp.solving.coarse_start import coarser, from_coarser
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Options
@@ -130,7 +130,7 @@ def test_without_a_coarse_start_there_are_others():
 
 def test_a_solution_is_kept_where_the_classical_design_fails(monkeypatch):
     problem = co.Solver(beside(), intervals=10)
-    monkeypatch.setattr(solver, "from_starts", raising_for_the_classical(solver.from_starts))
+    monkeypatch.setattr(classical_runs, "from_starts", raising_for_the_classical(classical_runs.from_starts))
     found = problem.solve(progress=False)
     assert found.converged
     assert "the linear system is singular" in found.stats["classical_missing"]

@@ -269,13 +269,13 @@ def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tup
     t, finer = extremal.trajectory, _parted(extremal, parts)
     scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
-    least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
-    size = np.maximum(np.ptp(values, axis=0), least)
+    rounded = ROUNDOFF * magnitude.max(initial=0.0)
+    size = np.maximum(np.ptp(values, axis=0), np.maximum(LEAST_RANGE * magnitude, rounded))
     with np.errstate(over="ignore", invalid="ignore"):
         moved, inside = np.cumsum(finer.jumps - gaps, axis=0), np.hstack([finer.states, finer.matrices]) - values
         total = np.abs(inside).max(axis=0)
         total[: moved.shape[1]] += np.abs(moved).max(axis=0)
-        left = np.abs(inside[-1, t.x.shape[1] :]) / final_deviations(extremal.statement, t.e)
+        left = np.abs(inside[-1, t.x.shape[1] :]) / np.maximum(final_deviations(extremal.statement, t.e), rounded)
         total[t.x.shape[1] :] = np.maximum(total[t.x.shape[1] :], left * size[t.x.shape[1] :])
     return total, size
 

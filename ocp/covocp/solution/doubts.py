@@ -59,7 +59,7 @@ def mention_doubts(solution: Solution) -> None:
     elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
         warn_user(
             f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
-            "its range. Use more intervals or substeps."
+            "its range, or at the end of itself. Use more intervals or substeps."
         )
     else:
         fine = True

@@ -61,7 +61,7 @@ class ClassicalRuns:
     ) -> tuple[Outcome, Prepared]:
         """From the nominal of the deterministic cost where a run failed; one that was given up soon at last goes on.
 
-        Not where the user asked for fewer iterations, or for more digits, than that would keep to.
+        Not where the user asked for so many iterations or digits, which that would not keep to.
         """
         if self.nominal != "combined" or not self.statement.behind or self._asked_for:
             return failed, prepared

@@ -30,7 +30,7 @@ from covocp.solving.attempts import best_of, counted, from_starts, interrupted, 
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
-from covocp.solving.classical_runs import TOLERANCE, ClassicalRuns
+from covocp.solving.classical_runs import ClassicalRuns
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -137,7 +137,7 @@ class Solver(ClassicalRuns):
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
         whole = nominal == "combined" and self._by_ipopt and refine is None
-        self._asked_for = "max_iterations" in own or (own.get("tolerance") or TOLERANCE) < TOLERANCE
+        self._asked_for = "max_iterations" in own or own.get("tolerance") is not None
         self._patient: dict[str, Any] = {}  # options of a run that is not given up soon
         if whole and not self._asked_for and impatient(self.statement):
             self._own, self._patient = {**self._own, "max_iterations": SOON}, {"max_iterations": None}
