@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import covocp as co
@@ -13,7 +14,7 @@ def at_a_saddle(weight: float, *, bounded: bool = True) -> co.Solution:
     """u = 0 of y(1) - weight x(1)^2 / 2 with x' = u, y = exp(-t)."""
     ocp = co.Problem(1.0)
     x, y = ocp.state("x", initial=0.0), ocp.state("y", initial=1.0)
-    u = ocp.control("u", lower=-3.0, upper=3.0) if bounded else ocp.control("u")
+    u = ocp.control("u", lower=-3.0, upper=3.0, guess=np.zeros(11)) if bounded else ocp.control("u", guess=np.zeros(11))
     ocp.dynamics(x, u)
     ocp.dynamics(y, -y)
     ocp.minimize(terminal=y - 0.5 * weight * x**2)

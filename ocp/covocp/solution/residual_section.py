@@ -105,13 +105,7 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     if name == "curvature" and np.isnan(value):
         return _unknown_curvature(solution)
     if name == "curvature" and solution.converged:
-        return (
-            "minimum"
-            if value > 0
-            else "NOT A MINIMUM"
-            if value < 0
-            else "flat: its sign, or what it could gain, is below the error"
-        )
+        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: sign or gain below the error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
