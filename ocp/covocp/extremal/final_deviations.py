@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, half_indices
 from covocp.statement.statement import Statement
 
 # Share of its largest value below which a variance at the end is zero.
@@ -20,9 +20,8 @@ def final_deviations(statement: Statement, e: Array) -> Array:
     for block in statement.matrices:
         if not block.covariance or block.span.start in statement.entries(statement.behind):
             continue
-        rows, columns = np.triu_indices(block.size)  # the lower triangle column by column
-        diagonal = rows == columns
-        variances = np.abs(e[:, block.span][:, diagonal])
+        rows, columns = half_indices(block.size)
+        variances = np.abs(e[:, block.span.start + np.flatnonzero(rows == columns)])
         own = np.sqrt(np.maximum(variances[-1], LEAST_SHARE * variances.max(axis=0)))
         result[block.span] = np.where(own[rows] * own[columns] > 0.0, own[rows] * own[columns], np.inf)
     return result

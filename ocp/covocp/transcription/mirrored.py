@@ -15,7 +15,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.starts import base_run, completed, own_start, stays, targets
+from covocp.transcription.starts import First, base_run, completed, own_start, stays, targets
 from covocp.transcription.steering import steer
 from covocp.transcription.trajectory import Trajectory
 
@@ -23,7 +23,9 @@ from covocp.transcription.trajectory import Trajectory
 COMBINED = 4
 
 
-def other_sides(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool) -> tuple[Trajectory, ...]:
+def other_sides(
+    statement: Statement, mesh: Mesh, parameters: Array, own: First, *, linked: bool
+) -> tuple[Trajectory, ...]:
     """Starts whose controls are bent to other sides, brought to the final values.
 
     The last ones are kept, as those of `own_start`.
@@ -32,20 +34,25 @@ def other_sides(statement: Statement, mesh: Mesh, parameters: Array, *, linked: 
         statement: the problem.
         mesh: of it.
         parameters: values (np,).
+        own: the problem's own start.
         linked: whether other phases may pay for what is learnt.
 
     Returns:
         The problem's own start as it is to be compared with them, and they, last all controls to the other side; none
         where what is learnt does not depend on the side, or the start was not bent.
     """
-    found = _other_sides if stays(statement) else _other_sides.__wrapped__
-    return found(statement, mesh, tuple(parameters), linked)
+    if stays(statement):
+        return _kept(statement, mesh, tuple(parameters), linked)
+    return _made(statement, mesh, parameters, own, linked)
 
 
 @lru_cache(maxsize=2)
-def _other_sides(statement: Statement, mesh: Mesh, values: tuple[float, ...], linked: bool) -> tuple[Trajectory, ...]:
+def _kept(statement: Statement, mesh: Mesh, values: tuple[float, ...], linked: bool) -> tuple[Trajectory, ...]:
     parameters = np.array(values)
-    own = own_start(statement, mesh, parameters)
+    return _made(statement, mesh, parameters, own_start(statement, mesh, parameters), linked)
+
+
+def _made(statement: Statement, mesh: Mesh, parameters: Array, own: First, linked: bool) -> tuple[Trajectory, ...]:
     if own.unbent is None or own.held or not own.plain or not _learns(statement, linked):
         return ()
     bend = own.trajectory.u - own.unbent

@@ -58,7 +58,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool 
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
         yield from _ways(statement, mesh, parameters, own, []) if free else []
-        yield replace(own, sides=other_sides(statement, mesh, parameters, linked=linked)) if free else own
+        yield replace(own, sides=other_sides(statement, mesh, parameters, own, linked=linked)) if free else own
         if own.held:
             yield own_start(statement, mesh, parameters, hold=False)
         if free:
