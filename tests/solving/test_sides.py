@@ -108,6 +108,7 @@ def test_the_side_that_was_best_is_taken_again():
     first = solver.solve(progress=False)
     again = solver.solve(progress=False)
     assert first.stats["tried"] == 2
+    assert "2 starts tried" in str(first)
     assert "tried" not in again.stats
     assert again.cost == pytest.approx(first.cost, rel=1e-9)
 

@@ -168,7 +168,8 @@ class Guess:
         tentative: whether there are others: a method that loses its way should stop.
         scales: units of a program that is made for it; None: chosen by the trajectory.
         held: whether a feedback holds an unstable nominal along it, which need not be the way.
-        rival: whether it is one of several ways round what may not be entered: the cheapest that comes of them counts.
+        rival: whether it is one of several ways round what may not be entered, or of several sides on which something
+            is learnt: the cheapest that comes of them counts.
         about: what a rival is thought to cost, NaN where nothing tells.
         alike: whether a rival has the magnitudes of the problem's own start, whose program serves it.
         sides: the start as it is to be compared with those that are bent to other sides, and these; none: one side.

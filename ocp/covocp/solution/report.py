@@ -404,6 +404,8 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{seconds:.3g} s")
     if stats.get(OTHERWISE):
         effort.append(f"{'found' if solution.converged else 'nor found'} by {stats[OTHERWISE]}")
+    if stats.get("tried", 1) > 1 and solution.within is None:
+        effort.append(f"{stats['tried']} starts tried")
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
     if "starts" in stats and solution.within is None:

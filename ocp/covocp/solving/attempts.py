@@ -262,7 +262,7 @@ def best_of(
     A start outside the domain of the model counts as one that did not converge.
 
     Raises:
-        ProblemError: all of them lie outside it (says what the first one lacks).
+        ProblemError: all of them lie outside it, or cannot begin (says what the first one lacks).
     """
     best: Any = None
     stopped: tuple[int, Any] | None = None
@@ -275,6 +275,8 @@ def best_of(
             else:
                 outcome = prepared.solve(values, _tentative(guess), reporter)
         except ProblemError as error:
+            if guess is not None and not isinstance(error, OutsideDomainError):
+                raise
             refused.append(error)
             costs.append(np.nan)
             continue

@@ -186,7 +186,7 @@ class ChainRuns:
     def _found(self, begun: Begun, prepared: Any) -> ChainOutcome:
         """From the first start from which the method finds its way; from the first one where there is none.
 
-        Where starts that are bent to other sides cost about the same, the cheapest outcome counts.
+        Beside it from starts that are bent to other sides, where these may learn more: the cheapest outcome counts.
         """
         values = begun.values
         (first, *beside), tried = self._sides(begun), 0
