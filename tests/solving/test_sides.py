@@ -190,7 +190,9 @@ def test_phases_find_the_side_of_one_problem():
         ocp.minimize(0.5 * u**2, 10 * E[b, b] if final is not None else 0.0)
         parts.append(ocp)
     whole = co.solve(lag(1.0, 0.0, 1.0), intervals=100, progress=False).cost
-    assert co.solve(co.Phases(parts), progress=False).cost == pytest.approx(whole, rel=1e-4)
+    found = co.solve(co.Phases(parts), progress=False)
+    assert found.cost == pytest.approx(whole, rel=1e-4)
+    assert f"{found.stats['tried']} starts tried" in str(found)
 
 
 def test_random_starts_begin_with_all_that_the_default_tries():

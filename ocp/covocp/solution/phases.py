@@ -261,6 +261,8 @@ class PhasesSolution:
         effort = refinement(self.stats)
         if "starts" in self.stats:
             effort.append(Sentence(starts_told(self.stats["starts"])))
+        if self.stats.get("tried", 1) > 1:
+            effort.append(Sentence(f"{self.stats['tried']} starts tried"))
         violated = [[name, number(value, 4)] for name, value in stated_first(self.violations)]
         limits: Section = [Table(columns=["violated constraint", "by"], rows=violated)] if violated else []
         phases = [section for phase in self.phases for section in sections(phase)]
