@@ -36,16 +36,32 @@ def _operation(code: int, plain: Callable[[Any, Any], Any]) -> Callable[[Expr, E
 
     def combined(a: Expr, b: Expr) -> Any:
         kind: Any = type(a) if type(a) in _SYMBOLIC else type(b)
-        if kind in _SYMBOLIC and all(type(v) is kind or type(v) is float or type(v) is int for v in (a, b)):
+        if kind in _SYMBOLIC and all(type(v) is kind or isinstance(v, (float, int)) for v in (a, b)):
             return kind.binary(code, a, b)
         return plain(a, b)
 
     return combined
 
 
+def dense(value: Expr) -> Any:
+    """An expression without structural zeros; to densify one that has none takes as long as many operations."""
+    return value if value.is_dense() else ca.densify(value)
+
+
 plus = _operation(ca.OP_ADD, operator.add)
 minus = _operation(ca.OP_SUB, operator.sub)
 times = _operation(ca.OP_MUL, operator.mul)
+over = _operation(ca.OP_DIV, operator.truediv)
+
+
+def above(values: Sequence[Expr]) -> Any:
+    """Columns one above the other; to join one alone takes as long as many operations."""
+    return values[0] if len(values) == 1 else ca.vertcat(ca.MX(0, 1) if not values else values[0], *values[1:])
+
+
+def beside(values: Sequence[Expr]) -> Any:
+    """The same side by side."""
+    return values[0] if len(values) == 1 else ca.horzcat(*values)
 
 
 def trial_values(count: int, after: int = 0) -> Any:
@@ -74,7 +90,7 @@ def slopes_by(value: Expr, symbols: Sequence[Expr]) -> list[Any]:
         parts = ca.vertsplit(whole, np.cumsum([0, *sizes]).tolist())
         return [ca.reshape(part, *symbol.shape) for part, symbol in zip(parts, symbols, strict=True)]
     slopes = ca.reverse([value], list(symbols), [[ca.MX(1)]])[0]  # what the value is made of stands there once
-    return [ca.densify(slope) for slope in slopes]
+    return [dense(slope) for slope in slopes]
 
 
 @lru_cache(maxsize=SEQUENCES)

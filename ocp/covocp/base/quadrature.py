@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr, plus, times
+from covocp.base.expressions import Expr, over, plus, times
 from covocp.base.linear_solve import linear_solve
 from covocp.base.matrices import Array
 
 # Nodes of the two-stage Gauss method, shares of a step, both of weight 1/2.
-GAP = np.sqrt(3.0) / 6.0
+GAP = math.sqrt(3.0) / 6.0
 GAUSS_NODES = (0.5 - GAP, 0.5 + GAP)
 # a of `gauss_transition`.
 SHARE = 0.5 - 2.0 * GAP
@@ -28,13 +29,13 @@ def classical_step(rate: Callable[[Any, float], Any], value: Expr, h: Expr, firs
         h: length of the step.
         first: the slope at the start, where it is known already.
     """
-    half = h / 2
+    half = over(h, 2)
     k1 = rate(value, 0.0) if first is None else first
     k2 = rate(plus(value, times(half, k1)), 0.5)
     k3 = rate(plus(value, times(half, k2)), 0.5)
     k4 = rate(plus(value, times(h, k3)), 1.0)
     total = plus(plus(plus(k1, times(2, k2)), times(2, k3)), k4)
-    return plus(value, times(h / 6, total))
+    return plus(value, times(over(h, 6), total))
 
 
 def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr) -> Any:

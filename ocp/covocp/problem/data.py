@@ -54,6 +54,8 @@ def _looked_up(name: str, times: Array, values: Array, degree: int) -> ca.Functi
 
 def used_data(problem: Declarations) -> tuple[TimeData, ...]:
     """The data that are in dynamics, noise, measurements, costs or constraints."""
+    if not problem.data:
+        return ()
     used = [value for rate in problem.rates.values() for value in (rate.rate, rate.noise)]
     used += [value for m in problem.measurements for value in (m.expression, m.noise, m.information)]
     used += [value for m in problem.matrices if m.backward is not None for value in m.backward.form]

@@ -59,8 +59,8 @@ def with_end_conditions(problem: Declarations) -> Declarations:
 
 def boundary(problem: Declarations) -> ca.Function:
     """Initial and final values of states and matrices as functions of the parameters; NaN: free, or a decision's."""
-    outputs, symbols = _outputs(problem), _decision_symbols(problem)
-    chosen = {symbol.__hash__() for symbol in ca.symvar(symbols)}
+    decisions, outputs = decisions_of(problem), _outputs(problem)
+    chosen = {symbol.__hash__() for entry in decisions for symbol in ca.symvar(entry.symbol)}
     own = [q.symbol for q in _fixed(problem)]
     known = {symbol.__hash__() for symbol in own}
     for symbol in ca.symvar(ca.veccat(*outputs)):
@@ -71,13 +71,12 @@ def boundary(problem: Declarations) -> ca.Function:
                 received=f"'{symbol.name()}'",
                 remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
             )
-    decisions = decisions_of(problem)
     function = ca.Function("boundary", [*own, *(entry.symbol for entry in decisions)], outputs)
     p, arguments = _split("parameters", own)
     guesses: list[Any] = [entry.guess for entry in decisions]
     values: list[Any] = list(function.call([*arguments, *(ca.DM(guess) for guess in guesses)], True, False))
-    for i, value in enumerate(outputs):
-        rows = list(_dependent(value, symbols))
+    for i, value in enumerate(outputs if decisions else ()):
+        rows = list(_dependent(value, _decision_symbols(problem)))
         if rows:
             kept = [ca.MX(ca.DM.nan(1)) if k in rows else values[i][k] for k in range(value.shape[0])]
             values[i] = ca.vertcat(*kept)
@@ -86,8 +85,9 @@ def boundary(problem: Declarations) -> ca.Function:
 
 def tied_values(problem: Declarations) -> Tied | None:
     """Initial values that decisions give; None where they give none."""
-    symbols = _decision_symbols(problem)
-    outputs = _outputs(problem)
+    if not decisions_of(problem):
+        return None
+    symbols, outputs = _decision_symbols(problem), _outputs(problem)
     states, matrices = (_dependent(outputs[i], symbols) for i in (0, 2))
     if not states and not matrices:
         return None
@@ -115,7 +115,7 @@ def _outputs(problem: Declarations) -> list[Any]:
         [nan if m.initial is None else m.initial for m, nan in pairs],
         [nan if m.final is None else m.final for m, nan in pairs],
     )
-    return [ca.vertcat(ca.MX(0, 1), *group) for group in groups]
+    return [group[0] if len(group) == 1 else ca.vertcat(ca.MX(0, 1), *group) for group in groups]
 
 
 def _fixed(problem: Declarations) -> list[Any]:

@@ -109,22 +109,27 @@ def block_between(
     return ca.densify(rows @ matrix @ columns.T)
 
 
+def _stands_for(key: Given, entry: AugmentedEntry | Control) -> bool:
+    """Whether a symbol or name is that of an entry."""
+    if isinstance(key, str):
+        return key == entry.name
+    # hashes of expressions are those of their nodes; to ask CasADi whether two are equal takes fifty times as long
+    return key is entry.symbol or (is_symbolic(key) and bool(key.__hash__() == entry.symbol.__hash__()))
+
+
 def _rows(letter: str, entries: Sequence[AugmentedEntry | Control], labels: tuple[str, ...], key: Given) -> Any:
     """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
     if isinstance(key, str) and key in labels:  # the name of a scalar, or of a component
         row = labels.index(key)
         return slice(row, row + 1)
     key = symbol_of(key)
-    offset, jacobians = 0, []
+    offset = 0
     for entry in entries:
         span = slice(offset, offset + error_size(entry))
-        if key is entry.symbol or (isinstance(key, str) and key == entry.name):
+        if _stands_for(key, entry):
             return span
-        if is_symbolic(key):
-            if key.is_symbolic() and ca.is_equal(key, entry.symbol):
-                return span
-            jacobians.append(tangent_slope(key, entry))
         offset = span.stop
+    jacobians = [tangent_slope(key, entry) for entry in entries] if is_symbolic(key) else []
     jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
     if jacobian.nnz() == 0:
         of_loop = any(isinstance(entry, Control) for entry in entries)

@@ -161,11 +161,13 @@ def _check_symbols(problem: Declarations, part: bool) -> None:
         (f"the rate of '{name}'", entry.rate) for name, entry in problem.rates.items()
     ]
     expressions += [(f"the noise of '{k}'", v.noise) for k, v in problem.rates.items() if v.noise is not None]
-    expressions += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
+    expressions += [(f"measurement '{m.name}'", value) for m in problem.measurements for value in (m.expression, m.noise)]
     expressions += [(f"'{c.name}'", c.expression) for c in problem.constraints]
-    expressions += [("the cost", ca.veccat(*(problem.cost or ())))]
+    expressions += [("the cost", value) for value in problem.cost or ()]
     if problem.spread is not None:
         hashes.add(problem.spread.symbol.__hash__())
+    if all(s.__hash__() in hashes for s in ca.symvar(ca.veccat(*(expression for _, expression in expressions)))):
+        return  # to ask for the symbols of each takes several times as long
     for what, expression in expressions:
         for symbol in ca.symvar(expression):
             if symbol.__hash__() not in hashes:

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import TABLE, Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import half_length
 from covocp.base.short_repr import short_repr
@@ -23,12 +23,14 @@ from covocp.statement.statement import INPUTS
 class Stacked:
     """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them.
 
-    geometry: of the states that are estimated, the first of all; unknowns: entries of these.
+    geometry: of the states that are estimated, the first of all; unknowns: entries of these; tables: whether the
+    user's expressions look something up in tables.
     """
 
     inputs: tuple[Any, ...]
     geometry: Geometry
     unknowns: int
+    tables: bool
     substitute: Callable[..., list[Any]]
     symbolic: type
 
@@ -74,34 +76,50 @@ def stack(problem: Declarations) -> Stacked:
     own: list[Any] = [entry.symbol for group in groups for entry in group] + [problem.time]
     if problem.free_duration is not None:
         own.append(problem.duration)
-    value: Any = None if problem.spread is None else problem.spread.value
-    known = own if problem.spread is None or value is None else [*own, problem.spread.symbol]
-    every = [entry.rate for entry in problem.rates.values()]
+    every = _every(problem)
+    try:
+        return _written(problem, own, every, ca.SX)
+    except RuntimeError:  # interpolation tables and external functions have no SX form
+        return _written(problem, own, every, ca.MX)
+
+
+def _every(problem: Declarations) -> list[Any]:
+    """Every expression of the user's."""
+    every: list[Any] = [entry.rate for entry in problem.rates.values()]
     every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     every += [value for m in problem.measurements for value in (m.expression, m.noise)]
     every += [m.information for m in problem.measurements if m.information is not None]
     every += [c.expression for c in problem.constraints] + list(problem.cost or ())
-    every += [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
-    symbolic: type = ca.SX
-    try:
-        ca.Function("everything", known, every).expand()
-    except RuntimeError:  # interpolation tables and external functions have no SX form
-        symbolic = ca.MX
-    sizes = [sum(entry.symbol.shape[0] for entry in group) for group in groups]
-    sizes[3:] = [sizes[3] + sizes[4]]
-    x, u, e, p = (symbolic.sym(n, k) for n, k in zip(("x", "u", "e", "p"), sizes, strict=True))  # type: ignore[attr-defined]
-    t, duration = symbolic.sym("t"), symbolic.sym("T")  # type: ignore[attr-defined]
+    return every + [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
+
+
+def _written(problem: Declarations, own: list[Any], every: list[Any], symbolic: Any) -> Stacked:
+    """The stacked symbols of a type, and the substitution of the user's symbols."""
+    groups: list[Any] = [problem.states, problem.controls, problem.matrices, [*problem.parameters, *problem.unknowns]]
+    x, u, e, p = (
+        symbolic.sym(name, sum(entry.symbol.shape[0] for entry in group))
+        for name, group in zip(("x", "u", "e", "p"), groups, strict=True)
+    )
+    t, duration = symbolic.sym("t"), symbolic.sym("T")
     arguments: list[Any] = []
-    groups[3:] = [[*problem.parameters, *problem.unknowns]]
     for group, vector in zip(groups, (x, u, e, p), strict=True):
         offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
         arguments += [vector[i:j] for i, j in pairwise(offsets)]
     arguments += [t, duration] if problem.free_duration is not None else [t]
-    if value is not None:
-        arguments += ca.Function("spread", own, [value]).call(arguments, True, False)
+    known, spread_of_loop = own, None if problem.spread is None else problem.spread.value
+    if spread_of_loop is not None:
+        known = [*own, problem.spread.symbol]  # type: ignore[union-attr]
+        arguments += ca.Function("spread", own, [spread_of_loop]).call(arguments, True, False)
+    everything = ca.Function("everything", known, every)
+    values = everything.call(arguments, True, False)
+    # To write one of them alone takes as long as to write all of them. The expressions are kept: others could come to
+    # lie where they were, and have their hashes.
+    written = {v.__hash__(): (v, value) for v, value in zip(every, values, strict=True) if isinstance(v, ca.MX)}
 
     def substitute(*expressions: Any, spread: Any = None) -> list[Any]:
         """The expressions in the stacked symbols; with another covariance of the closed loop where one is given."""
+        if spread is None and all(isinstance(v, ca.MX) and v.__hash__() in written for v in expressions):
+            return [written[v.__hash__()][1] for v in expressions]
         function = ca.Function("substitute", known, list(expressions))
         return list(function.call(arguments if spread is None else [*arguments[:-1], spread], True, False))
 
@@ -109,6 +127,7 @@ def stack(problem: Declarations) -> Stacked:
         inputs=(x, u, e, t, duration, p),
         geometry=Geometry.of(entry for entry in problem.states if entry.estimated),
         unknowns=sum(entry.size for entry in problem.unknowns),
+        tables=any(function.name().startswith(TABLE) for function in everything.find_functions()),
         substitute=substitute,
         symbolic=symbolic,
     )

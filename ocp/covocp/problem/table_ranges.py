@@ -30,6 +30,8 @@ def table_ranges(problem: Declarations, stacked: Stacked) -> Conditions | None:
     Returns:
         A row for each argument of each table; None where the path reads no table.
     """
+    if not stacked.tables:
+        return None
     found: dict[tuple[str, int], tuple[str, Any, float, float]] = {}
     for call in _calls(_along_the_path(problem)):
         limits = np.asarray(call.dep(call.n_dep() - 1).to_DM())

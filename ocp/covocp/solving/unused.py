@@ -193,7 +193,7 @@ def _mention_spread_noise(problem: Declarations) -> None:
 
 def _mention_idle(problem: Declarations, of: str = "") -> None:
     """Controls on which nothing depends: no method moves them from where they start. `of`: the phase, in words."""
-    used = {symbol.__hash__() for expression in _written(problem) for symbol in ca.symvar(expression)}
+    used = {symbol.__hash__() for symbol in ca.symvar(ca.veccat(ca.MX(0, 1), *_written(problem)))}
     idle = [control.name for control in problem.controls if control.symbol.__hash__() not in used]
     if idle:
         listed = " and ".join(f"'{name}'" for name in idle)

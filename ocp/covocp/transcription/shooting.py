@@ -7,13 +7,13 @@ the compiled passage.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr, sequence_of
+from covocp.base.expressions import Expr, beside, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.passage.library import functions
 from covocp.passage.sweep import passed_by, values_by
@@ -31,6 +31,9 @@ from covocp.transcription.steps import (
     taken_by_parts,
 )
 
+# Meshes of which columns are kept.
+MESHES = 16
+
 
 def repeat(column: Expr, count: int) -> Any:
     """A column repeated; one without entries stays without."""
@@ -47,9 +50,15 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     """The intervals of a mesh, a column for each."""
     n = mesh.intervals
     start, end = control_ends(mesh, u)
-    s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
-    reading = ca.DM(mesh.readings) if mesh.readings.size else ca.DM(0, n)
+    s, ds, reading = _of_mesh(mesh)
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
+
+
+@lru_cache(maxsize=MESHES)
+def _of_mesh(mesh: Mesh) -> tuple[ca.DM, ca.DM, ca.DM]:
+    """Starts and lengths of the intervals of a mesh, and what they read, a column each."""
+    reading = ca.DM(mesh.readings) if mesh.readings.size else ca.DM(0, mesh.intervals)
+    return ca.DM(mesh.nodes[None, :-1]), ca.DM(np.diff(mesh.nodes)[None]), reading
 
 
 def shoot(
@@ -121,16 +130,18 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval
     fine: list[Any] = []
     costs: list[Any] = []
     first_segment = first_interval = 0
+    alike = len(set(mesh.segments)) == 1
     for length in sorted(set(mesh.segments), reverse=True):
         count = mesh.segments.count(length)
         function = sequence_of(advance, length)
         function = function.map(count) if count > 1 else function
         span = slice(first_interval, first_interval + count * length)
-        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in intervals))
+        own = intervals if alike else intervals.columns(span)
+        outputs = function.call([start[:, first_segment : first_segment + count], *own])
         for collected, value in zip((ends, fine, costs), outputs, strict=True):
             collected.append(value)
         first_segment, first_interval = first_segment + count, span.stop
-    return ca.horzcat(*ends), ca.horzcat(*fine), ca.horzcat(*costs)
+    return beside(ends), beside(fine), beside(costs)
 
 
 def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:

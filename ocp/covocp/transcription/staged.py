@@ -95,19 +95,22 @@ def staged(
     function, pattern = _stage_slopes(statement, mesh.substeps)
     linear = mesh.control == "linear"
     active, places, spans = [], [], []
-    inside: list[Expr] = [ca.vec(starts), *([intervals.duration[0]] if free else [])]
-    times, offset = range(nx * len(mesh.segments), nx * len(mesh.segments) + free), starts.numel() + free
+    first_control = starts.numel() + free
+    last_control = first_control + nu * mesh.intervals  # where the controls at the ends of the intervals begin
+    inside: list[Expr] = [ca.vec(starts), *([intervals.duration[0]] if free else []), ca.vec(intervals.start)]
+    slope = ca.jacobian(ca.vertcat(*inside, *([ca.vec(intervals.end)] if linear else [])), w)
+    (constant,) = ca.Function("linear", [w], [slope]).call([ca.DM.zeros(w.shape[0])])
+    rows, times = list(range(first_control)), range(starts.numel(), first_control)
     for s, (i, j) in enumerate(pairwise(mesh.starts)):
         for first in range(nx + free, nx + free + (j - i) * nu, nu):
             after = first + nu if linear else first
             places.append((*range(first, first + nu), *range(after, after + nu), *range(nx, nx + free)))
             active.append(after + nu)
-        controls = ca.horzcat(intervals.start[:, i:j], *([intervals.end[:, j - 1]] if linear else []))
-        inside.append(ca.vec(controls))
-        spans.append((*range(s * nx, (s + 1) * nx), *times, *range(offset, offset + controls.numel())))
-        offset += controls.numel()
-    slope = ca.jacobian(ca.vertcat(*inside), w)
-    (constant,) = ca.Function("linear", [w], [slope]).call([ca.DM.zeros(w.shape[0])])
+        controls = [*range(first_control + i * nu, first_control + j * nu)]
+        if linear:
+            controls += range(last_control + (j - 1) * nu, last_control + j * nu)
+        spans.append((*range(s * nx, (s + 1) * nx), *times, *range(len(rows), len(rows) + len(controls))))
+        rows += controls
     steps = Steps(
         rows=nx,
         pattern=pattern,
@@ -121,7 +124,7 @@ def staged(
         slopes=in_columns(statement, function, mesh.intervals)(x[:, : mesh.intervals], fine, *intervals),
         count=len(mesh.segments),
         spans=tuple(spans),
-        linear=constant,
+        linear=constant[rows, :],
     )
 
 
