@@ -43,7 +43,7 @@ def _operation(code: int, plain: Callable[[Any, Any], Any]) -> Callable[[Expr, E
     return combined
 
 
-def dense(value: Expr) -> Any:
+def densified(value: Expr) -> Any:
     """An expression without structural zeros; to densify one that has none takes as long as many operations."""
     return value if value.is_dense() else ca.densify(value)
 
@@ -90,7 +90,7 @@ def slopes_by(value: Expr, symbols: Sequence[Expr]) -> list[Any]:
         parts = ca.vertsplit(whole, np.cumsum([0, *sizes]).tolist())
         return [ca.reshape(part, *symbol.shape) for part, symbol in zip(parts, symbols, strict=True)]
     slopes = ca.reverse([value], list(symbols), [[ca.MX(1)]])[0]  # what the value is made of stands there once
-    return [dense(slope) for slope in slopes]
+    return [densified(slope) for slope in slopes]
 
 
 @lru_cache(maxsize=SEQUENCES)

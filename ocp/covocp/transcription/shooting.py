@@ -68,6 +68,7 @@ def shoot(
     *,
     passage: Passage = None,
     run: tuple[Any, Any, Any] | None = None,
+    intervals: Interval | None = None,
 ) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval.
 
@@ -78,8 +79,10 @@ def shoot(
         passage: of eliminated matrices.
         run: what all segments give, where it is known: values at the ends of the intervals and of the substeps, running
             cost of the intervals, a column each.
+        intervals: `interval_columns` of the variables, where they are known.
     """
-    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+    if intervals is None:
+        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     together = statement.matrices and (not mesh.eliminated or statement.coupled)
     start = ca.vertcat(variables.x, variables.e) if together else variables.x
     advance = advancing(statement, mesh)
@@ -112,9 +115,8 @@ def advancing(statement: Statement, mesh: Mesh) -> ca.Function:
     return full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
 
 
-def nominal_run(statement: Statement, mesh: Mesh, variables: Expr) -> tuple[Any, Any, Any]:
+def nominal_run(statement: Statement, mesh: Mesh, variables: Expr, intervals: Interval) -> tuple[Any, Any, Any]:
     """What `run` of `shoot` is where the nominal runs alone."""
-    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     return _segments(mesh, nominal_interval(statement, mesh.substeps, mesh.step), variables.x, intervals)
 
 

@@ -39,7 +39,7 @@ class Taped:
 
     def __init__(self, statement: Statement, mesh: Mesh, variables: Variables, tape: Tape) -> None:
         """Run the nominal and all passages."""
-        run = nominal_run(statement, mesh, variables)
+        run = nominal_run(statement, mesh, variables, variables.intervals)
         symbols = [ca.MX.sym(name, *value.shape) for name, value in zip(("ends", "fine", "cost"), run, strict=True)]
         self.given = shoot(statement, mesh, variables, passage=tape.passed_by, run=(symbols[0], symbols[1], symbols[2]))
         self._calls = tape.calls

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr, slopes_by
+from covocp.base.expressions import Expr, above, densified, minus, over, plus, slopes_by, times
 from covocp.base.matrices import Array
 from covocp.passage.sweep import depends, passed_by
 from covocp.passage.written import Tape
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.limit_units import ALONG, row_units
@@ -50,8 +52,7 @@ def transcribe(
     nodes = shoot(statement, mesh, variables, passage=passage) if along is None else along.nodes
     running, terminal = _costs(variables, nodes)
     rows = _constraints(statement, mesh, scales, variables, nodes)
-    g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
-    p = ca.vertcat(variables.p)
+    g = above([entry.expression for entry in rows])
     depending = None
     if passage is not None and any(entry.dense for entry in rows):
         depending = _depending(variables, scales)
@@ -64,14 +65,14 @@ def transcribe(
         mesh=mesh,
         scales=scales,
         w=variables.w,
-        p=p,
-        f=(running + terminal) / variables.cost_scale,
+        p=variables.p,
+        f=over(plus(running, terminal), variables.cost_scale),
         g=g,
         rows=rows,
         gradient=None if along is None or by_stages is None else along.gradient(by_stages),
         jacobian=_jacobian(variables, nodes, rows, depending, by_stages),
-        evaluate=ca.Function("evaluate", [variables.w, p], outputs),
-        backward=_backward(statement, mesh, variables, p),
+        evaluate=ca.Function("evaluate", [variables.w, variables.p], outputs),
+        backward=_backward(statement, mesh, variables, variables.p),
         pieces=pieces(statement, mesh, scales, rows) if separable else (),
     )
 
@@ -103,7 +104,7 @@ def written_out(statement: Statement, mesh: Mesh, scales: Scales, tape: Tape) ->
         mesh=mesh,
         scales=scales,
         w=variables.w,
-        p=ca.vertcat(variables.p),
+        p=variables.p,
         f=f,
         g=g,
         rows=rows,
@@ -141,16 +142,24 @@ class _Variables:
         lengths = [nx * count, 0 if mesh.eliminated else ne * count, nu * nodes, int(statement.duration.free)]
         ends = np.cumsum([0, *lengths]).tolist()
         self.w = ca.MX.sym("w", ends[-1])
-        x, e, u, duration = (self.w[i:j] for i, j in pairwise(ends))
+        units = [np.tile(scales.x, count), np.zeros(0) if mesh.eliminated else np.tile(scales.e, count)]
+        units += [np.broadcast_to(scales.u, (nodes, nu)).ravel(), np.full(lengths[-1], scales.duration)]
+        values = times(ca.MX(ca.DM(np.concatenate(units))), self.w)
+        x, e, u, duration = (values[i:j] for i, j in pairwise(ends))
         self.p = ca.MX.sym("p", statement.np + 1)
-        self.parameters, self.cost_scale = ca.vertsplit(self.p, [0, statement.np, statement.np + 1])
-        self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
-        self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
+        self.parameters, self.cost_scale = self.p[: statement.np], self.p[statement.np]
+        self.x = ca.reshape(x, nx, count)
+        self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count)
         if self.e is not None and statement.tied is not None and statement.tied.matrices:
             first = statement.started(self.x[:, 0], self.parameters, self.e[:, 0])[1]
             self.e = ca.horzcat(first, self.e[:, 1:])
-        self.u = mesh.acting(ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T))
-        self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
+        self.u = mesh.acting(ca.reshape(u, nu, nodes))
+        self.duration = duration if statement.duration.free else ca.MX(statement.duration.guess)
+
+    @cached_property
+    def intervals(self) -> Interval:
+        """The intervals of the mesh, a column for each."""
+        return interval_columns(self.mesh, self.u, self.duration, self.parameters)
 
 
 def _constraints(
@@ -277,8 +286,7 @@ def _inside_rows(
     path = statement.path
     if path.size:
         at = [k * mesh.points + j for k in range(n) for j in range(1, mesh.points)]
-        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-        points = intervals.substeps(mesh.points).columns(at)
+        points = variables.intervals.substeps(mesh.points).columns(at)
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
         places = Columns(nodes["x_inside"], points.start, e, variables.duration * points.s)
         value = path.columns(places, variables.duration, variables.parameters)
@@ -309,14 +317,13 @@ def _final_matrices(statement: Statement, scales: Scales, last: Expr) -> list[Ro
 
 def _dense(rows: tuple[Rows, ...]) -> Any:
     """The rows that depend on eliminated matrices."""
-    return ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows if entry.dense))
+    return above([entry.expression for entry in rows if entry.dense])
 
 
 def _staged(variables: _Variables, nodes: dict[str, Any]) -> Staged:
     """The segments of the NLP by the stages of their steps."""
     mesh, states = variables.mesh, (nodes["x"], nodes["run"][1])
-    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-    return staged(variables.statement, mesh, states, intervals, variables.w, variables.x[:, :-1])
+    return staged(variables.statement, mesh, states, variables.intervals, variables.w, variables.x[:, :-1])
 
 
 class _AlongRun:
@@ -324,11 +331,12 @@ class _AlongRun:
 
     def __init__(self, variables: _Variables) -> None:
         self._variables = variables
-        self._run = nominal_run(variables.statement, variables.mesh, variables)
+        self._run = nominal_run(variables.statement, variables.mesh, variables, variables.intervals)
         names = ("ends", "fine", "cost")
         self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
         ends, fine, costs = self._given
-        self._nodes = shoot(variables.statement, variables.mesh, variables, passage=passed_by, run=(ends, fine, costs))
+        known = {"run": (ends, fine, costs), "intervals": variables.intervals}
+        self._nodes = shoot(variables.statement, variables.mesh, variables, passage=passed_by, **known)
 
     @property
     def nodes(self) -> dict[str, Any]:
@@ -343,13 +351,17 @@ class _AlongRun:
         """The cost and its slopes: by what is given by CasADi, of the run by the stages."""
         variables = self._variables
         w, p, nx, n = variables.w, variables.p, variables.statement.nx, variables.mesh.intervals
-        cost: Any = sum(_costs(variables, self._nodes)) / variables.cost_scale
+        cost = over(plus(*_costs(variables, self._nodes)), variables.cost_scale)
         slopes = slopes_by(cost, [w, *self._given])
         after = ca.Function("cost_after_run", [w, p, *self._given], [cost, *slopes])
         value, by_w, by_ends, by_fine, by_costs = after(w, p, *self._run)
         tall = nx * variables.mesh.substeps
-        seeds: Expr = ca.reshape(by_fine, tall, n) + ca.vertcat(ca.DM(tall - nx, n), by_ends)
-        return value, by_w + by_stages.cost_slopes(ca.densify(ca.reshape(seeds, *by_fine.shape)), by_costs)
+        if variables.mesh.substeps == 1:
+            seeds = plus(by_fine, by_ends)
+        else:
+            seeds = ca.reshape(by_fine, tall, n) + ca.vertcat(ca.DM(tall - nx, n), by_ends)
+            seeds = ca.reshape(seeds, *by_fine.shape)
+        return value, plus(by_w, by_stages.cost_slopes(densified(seeds), by_costs))
 
 
 def _costs(variables: _Variables, nodes: dict[str, Any]) -> tuple[Any, Any]:
@@ -383,12 +395,12 @@ def _jacobian(
         if by_stages is not None:
             slopes = by_stages.segment_slopes()
         else:
-            intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-            slopes = segment_slopes(statement, mesh, nodes["x"], intervals, w, variables.x[:, :-1])
-        unscaled = slopes - ca.jacobian(ca.vec(variables.x[:, 1:]), w)
+            slopes = segment_slopes(statement, mesh, nodes["x"], variables.intervals, w, variables.x[:, :-1])
+        unscaled = minus(slopes, ca.jacobian(ca.vec(variables.x[:, 1:]), w))
         blocks.append(ca.mtimes(ca.diag(ca.DM(1 / rows[0].scale)), unscaled))
         others = others[1:]
-    blocks.append(ca.jacobian(ca.vertcat(ca.MX(0, 1), *others), w))
+    if others:
+        blocks.append(ca.jacobian(above(others), w))
     if depending is not None:
         pattern = ca.jacobian_sparsity(depending, w)
         unit = ca.horzsplit(ca.DM.eye(dense.shape[0]), LARGEST_DIRECTIONS)
@@ -396,4 +408,4 @@ def _jacobian(
         blocks.append(ca.project(by_w.T, pattern))
     elif dense.shape[0]:
         blocks.append(ca.jacobian(dense, w))
-    return ca.vertcat(*blocks)
+    return above(blocks)
