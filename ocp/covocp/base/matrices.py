@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from covocp.base.expressions import Expr, Given
+from covocp.base.expressions import Expr, Given, densified, plus, times
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -203,8 +203,8 @@ def pack_symbolic(matrix: Expr) -> Any:
     size = matrix.shape[0]
     rows, columns = half_indices(size)
     lower, upper = columns * size + rows, rows * size + columns
-    flat = ca.vec(ca.densify(matrix))
-    return 0.5 * (flat[lower.tolist()] + flat[upper.tolist()])
+    flat = ca.vec(densified(matrix))
+    return times(0.5, plus(flat[lower.tolist()], flat[upper.tolist()]))
 
 
 def unpack_symbolic(half: Expr, size: int) -> Any:

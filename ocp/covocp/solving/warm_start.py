@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError, spelling
@@ -127,7 +128,8 @@ def _from_solution(
         made = simulate_matrices(statement, mesh, trajectory.x, trajectory.u, e0, duration, parameters)
         trajectory = replace(trajectory, e=made)
     if not statement.noise_varies:  # what parameters say has no better place to go on to
-        check_measured(statement, trajectory.x[0], trajectory.u[0], duration, parameters)
+        start = [trajectory.x[0], trajectory.u[0], 0.0, duration, parameters]
+        check_measured(statement, [ca.DM(given) for given in start])
     st = statement
     constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
     own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)

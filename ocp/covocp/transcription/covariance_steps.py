@@ -22,7 +22,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, times
 from covocp.base.linear_solve import LINEAR_SOLVER, SCALAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_arrivals, gauss_matrix, hermite, riccati_step
@@ -80,13 +80,13 @@ def gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Functio
     points = []
     for j, c in enumerate(GAUSS_NODES):
         drift, noise, information = form(*interval.at(c, known[:, j]))
-        points.append(interval.h * ca.blockcat([[-drift.T, information], [noise, drift]]))
+        points.append(times(interval.h, ca.blockcat([[-drift.T, information], [noise, drift]])))
     return ca.Function("gauss_points", [xa, xb, *interval], points, slopes_wanted(statement, 2))
 
 
 def _hermite_points(statement: Statement, xa: Expr, xb: Expr, interval: Interval) -> Expr:
     """The nominal at the Gauss points of a step, by a cubic Hermite polynomial between its ends."""
-    fa, fb = (interval.h * state_slope(statement, *interval.at(c, x)) for c, x in ((0.0, xa), (1.0, xb)))
+    fa, fb = (times(interval.h, state_slope(statement, *interval.at(c, x))) for c, x in ((0.0, xa), (1.0, xb)))
     return ca.horzcat(*(hermite(xa, xb, fa, fb, c) for c in GAUSS_NODES))
 
 
@@ -122,7 +122,7 @@ def state_slope(statement: Statement, *point: Expr) -> Expr:
     """Rate of the nominal at (x, u, t, T, p)."""
     if statement.nominal is None:
         raise ValueError("a coupled problem has no separate nominal")
-    return statement.nominal(*point)[0]
+    return statement.nominal.call(point)[0]
 
 
 def _gauss_step(matrix: Expr, half: Expr, size: int, solver: str) -> Any:

@@ -254,20 +254,23 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
     Raises:
         ProblemError: names the rate, the cost, the constraint or the measurement.
     """
-    arguments = (x, u, e, 0.0, duration, parameters)
-    check_measured(statement, x, u, duration, parameters)
+    arguments = [ca.DM(given) for given in (x, u, e, 0.0, duration, parameters)]
+    without_matrices = [*arguments[:2], *arguments[3:]]
+    check_measured(statement, without_matrices)
     if statement.loop is not None:
-        weights = np.asarray(statement.loop.expansion(x, u, 0.0, duration, parameters)[3].full())
+        weights = np.asarray(statement.loop.expansion.call(without_matrices)[3].full())
         fed = statement.control_names[: weights.shape[0]]
         check_density(", ".join(fed), "control weight", weights, definite=True)
-    rates, matrix_rates, running = (np.asarray(v.full()).ravel() for v in statement.rates(*arguments))
+    rates, matrix_rates, running = (np.asarray(v.full()).ravel() for v in statement.rates.call(arguments))
     groups = [
         ("rate of", statement.state_names, rates),
         ("rate of", statement.matrix_names, matrix_rates),
         ("cost", ("running",), running),
     ]
     for conditions in (statement.path, statement.start):
-        groups.append(("constraint", conditions.names, np.asarray(conditions.function(*arguments).full()).ravel()))
+        if conditions.size:
+            values = np.asarray(conditions.function.call(arguments)[0].full()).ravel()
+            groups.append(("constraint", conditions.names, values))
     for what, names, values in groups:
         for name, value in zip(names, values, strict=True):
             if not np.isfinite(value):
@@ -279,28 +282,31 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
                 )
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
         if form is not None and block.estimation:
-            noise = np.asarray(form(x, u, 0.0, duration, parameters)[1].full())
+            noise = np.asarray(form.call(without_matrices)[1].full())
             check_density(", ".join(statement.augmented), "process noise density", noise, definite=False)
 
 
-def check_measured(statement: Statement, x: Array, u: Array, duration: float, parameters: Array) -> None:
+def check_measured(statement: Statement, at: list[Any]) -> None:
     """The noise of what is measured, at the start; at instants where it has one value that parameters say.
+
+    Args:
+        statement: the problem.
+        at: (x, u, t, T, p), numbers of CasADi.
 
     Raises:
         ProblemError: names the measurement.
     """
-    at = (x, u, 0.0, duration, parameters)
     if statement.information is not None:
-        stated = np.asarray(statement.information(*at).full())
+        stated = np.asarray(statement.information.call(at)[0].full())
         check_density(", ".join(statement.measurement_names), "information", np.diagflat(stated), definite=False)
     if statement.measurement is not None:
-        density = np.asarray(statement.measurement(*at)[2].full())
+        density = np.asarray(statement.measurement.call(at)[2].full())
         for block in statement.measurements:
             own = density[block.span, block.span]
             check_density(block.name, "measurement noise density", own, definite=True)
     samples = statement.samples
     if samples is not None and not any(samples.measurement.jac_sparsity(2, k).nnz() for k in range(len(at) - 1)):
-        variance = np.asarray(samples.measurement(*at)[2].full())
+        variance = np.asarray(samples.measurement.call(at)[2].full())
         for block in samples.blocks:
             check_density(block.name, "measurement noise variance", variance[block.span, block.span], definite=True)
 

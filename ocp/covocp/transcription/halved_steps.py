@@ -113,7 +113,7 @@ class _Runs:
         st, mesh = self._statement, self._mesh
         kept = not st.matrices or compiled_steps(mesh)  # a long sequence of CasADi's steps takes memory for all of it
         if not kept or not self._often("segments"):
-            return [np.asarray(ca.DM(v).full()) for v in self._shot([ca.DM(array) for array in start])]
+            return [np.asarray(v.full()) for v in self._shot([ca.DM(array) for array in start])]
         if self._made is None:
             symbols = [ca.MX.sym(name, *array.shape) for name, array in zip(_STARTS, start, strict=True)]
             self._made = Matrices(ca.Function("runs", symbols, self._shot(symbols)))
@@ -133,14 +133,14 @@ class _Runs:
         st, mesh, count = self._statement, self._mesh, self._mesh.intervals
         if self._often("states"):
             return nominal_states(st, mesh, x, u, duration, parameters)
-        common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
+        common = interval_columns(mesh, ca.DM(u.T), ca.DM(duration), ca.DM(parameters))
         advance = nominal_interval(st, mesh.substeps, mesh.step)
         values: list[Any] = [ca.DM(x)]
         lengths = [min(NUMERIC_RUN, count - first) for first in range(0, count, NUMERIC_RUN)]
-        pieces = [ca.horzsplit(ca.DM(column), NUMERIC_RUN) for column in common]
+        pieces = [ca.horzsplit(column, NUMERIC_RUN) for column in common]
         for length, *columns in zip(lengths, *pieces, strict=True):
-            values.append(sequence_of(advance, length)(values[-1][:, -1], *columns)[0])
-        return np.asarray(ca.DM(ca.horzcat(*values)).full()).T
+            values.append(sequence_of(advance, length).call([values[-1][:, -1], *columns])[0])
+        return np.asarray(ca.horzcat(*values).full()).T
 
 
 @lru_cache(maxsize=MESHES)

@@ -176,11 +176,11 @@ def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tup
 
         def rate(value: Expr, c: float, part: Interval = part, stages: list[Any] = stages) -> Expr:
             stages.append((value, c))
-            return statement.nominal(*part.at(c, value))[0]  # type: ignore[misc]
+            return statement.nominal.call(part.at(c, value))[0]  # type: ignore[union-attr]
 
         classical_step(rate, x if j == 0 else fine[:, j - 1], part.h)
         for value, c in stages:
-            moved, by_x, by_u, by_time, by_duration = rates(*part.at(c, value))
+            moved, by_x, by_u, by_time, by_duration = rates.call(part.at(c, value))
             share, h = (j + c) / substeps, part.h
             blocks = [times(h, by_x), times(times(1 - share, h), by_u), times(times(share, h), by_u)]
             if statement.duration.free:
@@ -191,7 +191,9 @@ def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tup
     for slope in found:
         pattern = pattern + slope.sparsity()
     shape = ca.Sparsity.dense(pattern.nnz(), 1)
-    columns = ca.horzcat(*(ca.sparsity_cast(ca.project(slope, pattern), shape) for slope in found))
+    columns = ca.horzcat(
+        *(s.nz[:] if s.sparsity() == pattern else ca.sparsity_cast(ca.project(s, pattern), shape) for s in found)
+    )
     row, column = pattern.get_triplet()
     function = ca.Function("stage_slopes", [x, fine, *interval], [columns], slopes_wanted(statement, 2))
     return function, (tuple(row), tuple(column))

@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, over
 from covocp.base.linear_solve import LINEAR_SOLVER, SCALAR_SOLVER
 from covocp.base.matrices import pack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, hermite, simpson_weight
@@ -52,7 +52,7 @@ def nominal_interval(statement: Statement, substeps: int, step: StepKind) -> ca.
     x, interval = symbolic.sym("x", statement.nx), Interval.symbols(statement)
 
     def rate(part: Interval, value: Expr, c: float) -> Expr:
-        return ca.vertcat(*nominal(*part.at(c, value[:-1])))
+        return ca.vertcat(*nominal.call(part.at(c, value[:-1])))
 
     states, cost = _classical_steps(statement, rate, ca.vertcat(x, 0), interval, substeps)
     return ca.Function("nominal_interval", [x, *interval], [states[:, -1], states, cost], slopes_wanted(statement, 1))
@@ -106,7 +106,7 @@ def _classical_steps(
     values = [start]
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
-        after = statement.geometry.step(partial(rate, part), values[-1], interval.h / substeps)
+        after = statement.geometry.step(partial(rate, part), values[-1], over(interval.h, substeps))
         values.append(after if read is None else read(part, after))
     stacked: Expr = ca.horzcat(*values[1:])
     return stacked[:-1, :], stacked[-1, -1]

@@ -67,20 +67,21 @@ def _stiffness(statement: Statement, options: Options, parameters: Array, at_end
         final = statement.boundary_values(parameters)[1]
         x = np.where(np.isnan(final), x, final)
     duration = statement.duration.guess
-    rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
+    arguments = [ca.DM(given) for given in (x, u, e, 0.0, duration, parameters)]
+    rates = _eigenvalues(state_jacobian(statement).call(arguments)[0].full())
     longest = duration * float(np.diff(nodes).max())
     matrices = 0.0
     for block, form, source in zip(statement.matrices, statement.riccati, statement.sources, strict=True):
         if block.role == "integral":
             continue
         if form is None or source is not None:
-            slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
+            slope = _matrix_jacobian(statement).call(arguments)[0].full()
             matrices = max(matrices, _largest(_eigenvalues(slope)))
             break
         if block.estimation and isinstance(options.grid, Graded) and options.grid.stiffness is not None:
             matrices = max(matrices, options.grid.stiffness / longest)
             continue
-        drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
+        drift, _, information = (np.asarray(v.full()) for v in form.call([*arguments[:2], *arguments[3:]]))
         with np.errstate(invalid="ignore"):  # a density that is zero: refused by its name later
             filtered = drift - unpack(e[block.span], block.size) @ information
         matrices = max(matrices, 2 * _largest(_eigenvalues(filtered)))
