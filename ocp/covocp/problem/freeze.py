@@ -161,14 +161,17 @@ def _check_symbols(problem: Declarations, part: bool) -> None:
         (f"the rate of '{name}'", entry.rate) for name, entry in problem.rates.items()
     ]
     expressions += [(f"the noise of '{k}'", v.noise) for k, v in problem.rates.items() if v.noise is not None]
-    expressions += [(f"measurement '{m.name}'", value) for m in problem.measurements for value in (m.expression, m.noise)]
+    expressions += [
+        (f"measurement '{m.name}'", value) for m in problem.measurements for value in (m.expression, m.noise)
+    ]
     expressions += [(f"'{c.name}'", c.expression) for c in problem.constraints]
-    expressions += [("the cost", value) for value in problem.cost or ()]
+    cost = ca.veccat(*(problem.cost or ()))
+    expressions += [("the cost", cost)]
     if problem.spread is not None:
         hashes.add(problem.spread.symbol.__hash__())
-    if all(s.__hash__() in hashes for s in ca.symvar(ca.veccat(*(expression for _, expression in expressions)))):
-        return  # to ask for the symbols of each takes several times as long
-    for what, expression in expressions:
+    everything = ca.veccat(*(expression for _, expression in expressions))
+    every_known = all(symbol.__hash__() in hashes for symbol in ca.symvar(everything))
+    for what, expression in () if every_known else expressions:  # to ask for the symbols of each takes longer
         for symbol in ca.symvar(expression):
             if symbol.__hash__() not in hashes:
                 twin = symbol.name() in known
@@ -195,7 +198,7 @@ def _check_symbols(problem: Declarations, part: bool) -> None:
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
     longer = problem.free_duration is not None and problem.cost is not None and not problem.cost[0].is_zero()
-    if not part and not longer and all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
+    if not part and not longer and all(symbol.__hash__() in constants for symbol in ca.symvar(cost)):
         raise ProblemError(
             "The cost depends on nothing that can be chosen.",
             expected="a cost of states, controls, matrix states or the free duration",

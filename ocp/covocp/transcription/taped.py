@@ -17,10 +17,11 @@ from covocp.transcription.shooting import nominal_run, shoot
 
 
 class Variables(Protocol):
-    """Of a program: the column of all, parameters, and what `shoot` reads."""
+    """Of a program: the column of all, parameters, the intervals, and what `shoot` reads."""
 
     w: Any
     p: Any
+    intervals: Any
 
 
 class Taped:

@@ -335,8 +335,8 @@ class _AlongRun:
         names = ("ends", "fine", "cost")
         self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
         ends, fine, costs = self._given
-        known = {"run": (ends, fine, costs), "intervals": variables.intervals}
-        self._nodes = shoot(variables.statement, variables.mesh, variables, passage=passed_by, **known)
+        of, run, intervals = variables.statement, (ends, fine, costs), variables.intervals
+        self._nodes = shoot(of, variables.mesh, variables, passage=passed_by, run=run, intervals=intervals)
 
     @property
     def nodes(self) -> dict[str, Any]:
