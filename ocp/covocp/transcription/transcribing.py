@@ -153,7 +153,7 @@ class _Variables:
         if self.e is not None and statement.tied is not None and statement.tied.matrices:
             first = statement.started(self.x[:, 0], self.parameters, self.e[:, 0])[1]
             self.e = ca.horzcat(first, self.e[:, 1:])
-        self.u = mesh.acting(ca.reshape(u, nu, nodes))
+        self.u = mesh.acting(ca.reshape(u, nu, nodes)) if nu else ca.MX(0, nodes)
         self.duration = duration if statement.duration.free else ca.MX(statement.duration.guess)
 
     @cached_property
