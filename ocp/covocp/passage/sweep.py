@@ -18,7 +18,7 @@ from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
-KEPT_BYTES = 20_000_000
+KEPT_BYTES = 12_000_000
 
 # Numbers in the factors of all X above which a passage keeps nothing but the half-vectors that are wanted.
 MOST_FACTORS = 1_000_000
