@@ -173,6 +173,8 @@ def _made_ready(
             "max_iter": MAX_ITERATIONS if max_iterations is None else max_iterations,
             # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
             "fixed_variable_treatment": "make_parameter_nodual",
+            # above what MUMPS expects to need; it is given more where that is not enough. 1000 by default
+            "mumps_mem_percent": 100,
         }
         for (statement, mesh), values in zip(pairs, parameters, strict=True):
             if statement.loop is not None and not mesh.eliminated:

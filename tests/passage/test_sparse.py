@@ -183,16 +183,18 @@ def by_stages(
 
 
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
-@pytest.mark.parametrize("kind", ["chain", "poor pivots", "much measured"])
+@pytest.mark.parametrize("kind", ["chain", "poor pivots", "much measured", "strongly damped"])
 @pytest.mark.parametrize("rows", [1, 2, 3])
-def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows):
-    """Of factors alone; then all stages are asked for, and are there from then on."""
+@pytest.mark.parametrize("most", [10**6, 0])
+def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows, most):
+    """Of factors alone, or of what is wanted; then all stages are asked for, and are there from then on."""
     monkeypatch.setattr(ordering, "LARGEST_SHARE", 1e9)
+    monkeypatch.setattr(sweep, "MOST_FACTORS", most)
     n, count, every = 10, 20, 2
     if kind == "poor pivots":
         both = oscillators(count)
     else:
-        F, Q, W = chain(n)
+        F, Q, W = chain(n, damping=30.0 if kind == "strongly damped" else 0.3)
         H = 0.2 * np.block([[-F.T, W * (1e5 if kind == "much measured" else 1.0)], [Q, F]])
         both = np.tile(H, count), np.tile(1.01 * H, count)
     pattern = ca.sparsify(ca.DM(np.abs(both[0][:, : 2 * n]))).sparsity()
@@ -216,6 +218,44 @@ def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows):
             found = float(np.sum(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape)))
             size = float(np.sum(np.abs(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape))))
             assert abs(found - known[0]) <= 1e-8 * size
+
+
+@pytest.mark.parametrize("reads", [(), (5, 6, 23)])
+@pytest.mark.parametrize("kicked", [False, True])
+@pytest.mark.parametrize("every", [1, 3])
+def test_slopes_where_nothing_is_kept_are_those_where_all_is(monkeypatch, reads, kicked, every):
+    """With readings among the steps and with what is added between them; some steps measure much."""
+    monkeypatch.setattr(ordering, "LARGEST_SHARE", 1e9)
+    n, count = 10, 30
+    moves, half, rng = count - len(reads), half_length(n), np.random.default_rng(5)
+    F, Q, W = chain(n)
+    H = [0.2 * np.block([[-F.T, W * (1e5 if k == 12 else 1.0)], [Q, F]]) for k in range(moves)]
+    pattern = ca.sparsify(ca.DM(np.abs(H[0]))).sparsity()
+    entries = pattern.nnz()
+    points = [
+        np.hstack([np.asarray(ca.DM(ca.project(ca.DM(share * h), pattern)).nonzeros())[:, None] for h in H])
+        for share in (1.0, 1.01)
+    ]
+    given = [pack(prior(n)), *points]
+    given += [np.vstack([rng.normal(size=(n, len(reads))), np.ones((1, len(reads)))])] if reads else []
+    given += [np.vstack([pack(0.01 * prior(n))] * (count // every)).T] if kicked else []
+    C = np.zeros((n, n))
+    C[-2:, -2:] = [[1.0, 0.5], [0.5, 2.0]]
+    seeds = np.zeros((half, count // every))
+    seeds[:, -2] = pack(C)
+    found = []
+    for most in (10**6, 0):
+        monkeypatch.setattr(sweep, "MOST_FACTORS", most)
+        made = kept(n, tuple(map(tuple, pattern.get_triplet())), count, kicked, reads, len(reads[:1]), False, every)
+        symbols = [ca.MX.sym(f"a{k}", *np.reshape(a, (len(a), -1)).shape) for k, a in enumerate(given)]
+        own = ca.MX.sym("s", *seeds.shape)
+        after = made(*symbols)
+        slopes = ca.Function("f", [*symbols, own], [after, *(ca.jtimes(after, x, own, True) for x in symbols)])
+        found.append([np.asarray(values.full()) for values in slopes(*given, seeds)])
+    assert found[0][1 + 1].shape == (entries, moves)
+    assert np.array_equal(found[0][0], found[1][0])
+    for one, other in zip(*found, strict=True):
+        assert np.abs(one - other).max() <= 1e-12 * np.abs(one).max()
 
 
 def test_a_large_chain_is_the_differential_equation():

@@ -43,7 +43,7 @@ def test_both_give_the_same_and_nothing_is_written_behind_the_results(n: int, in
     results = [np.full(int(there["exported_length"](own.ctypes.data, of)) + GUARD, -7.0) for of in (0, 1)]
     at = [array.ctypes.data for array in (own, chosen, first, h1, h2, *results)]
     there["exported_forward"](*at[:6])
-    memory = there["passage_new"](at[0], own.size, 0)
+    memory = there["passage_new"](at[0], own.size, 0, 10**6)
     after = np.empty((STEPS, half_length(n)))
     there["passage_forward"](memory, *at[2:5], None, None, after.ctypes.data)
     size = np.abs(after).max(axis=1, keepdims=True)

@@ -10,6 +10,9 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.threads import briefly
 
+# Numbers that a function works in above which they are there during a call alone: they take less time than it.
+MOST_KEPT = 1_000_000
+
 
 class Buffered:
     """A function of dense arguments, with memory of its own; not for two threads at a time."""
@@ -23,23 +26,28 @@ class Buffered:
         self._function = function
         self._arguments = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self._results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
+        self._kept = self._memory() if function.sz_w() <= MOST_KEPT else None
+
+    def _memory(self) -> tuple[Any, Any]:
+        """What CasADi works in, and the call."""
         buffer: Any
-        buffer, self._run = function.buffer()
+        buffer, run = self._function.buffer()
         for i, array in enumerate(self._arguments):
             buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
         for i, array in enumerate(self._results):
             buffer.set_res(i, memoryview(array))  # type: ignore[arg-type]
-        self._buffer = buffer
+        return buffer, run
 
     def __call__(self, *arguments: Array) -> tuple[Array, ...] | None:
         """The nonzero entries of the outputs, copied; None where the function fails."""
         for memory, argument in zip(self._arguments, arguments, strict=True):
             memory[:] = argument
+        buffer, run = self._kept or self._memory()
         try:
-            self._run()
+            run()
         except RuntimeError:
             return None
-        if self._buffer.ret():
+        if buffer.ret():
             return None
         return tuple(result.copy() for result in self._results)
 

@@ -159,8 +159,10 @@ static void tangents(
         const int place = p->place[k];
         if (place < 0)
             tangent_reading(kept, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
-        else
+        else {
+            if (!p->brief) factorize(p, place);
             tangent_step(kept, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
+        }
         spread(after, n, E);
         if (!wanted) continue;
         if (d_kicks)

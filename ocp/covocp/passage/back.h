@@ -136,17 +136,31 @@ static void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRI
         for (int i = j; i < n; ++i, ++t) half[t] = i == j ? P[i * n + j] : P[i * n + j] + P[j * n + i];
 }
 
+/* Slopes by H at one point, from its stage times M, (2n x r); weighted: as large. */
+INLINE void slopes_few(
+    const Passage *p, int n, const int r, const double *C, const double *y, double *RESTRICT weighted, double *out
+) {
+    for (int i = 0; i < 2 * n; ++i)
+        for (int c = 0; c < r; ++c) {
+            double sum = 0.0;
+            for (int q = 0; q < r; ++q) sum += y[i * r + q] * C[q * r + c];
+            weighted[i * r + c] = sum;
+        }
+    at_nonzeros(p, n, r, y, weighted, out);
+}
+
 /* Slopes before step k and by its H: few columns; `before`: half-vector there. */
 INLINE void back_few(
     const Passage *p, int n, const int r, int k, Slopes *s, const double *before, double *spare, double *s1, double *s2
 ) {
-    const size_t square = (size_t)n * n, tall = (size_t)2 * n * r;
+    const size_t square = (size_t)n * n, tall = (size_t)2 * n * r, own = spot(p, k);
     double *y = spare, *weighted = y + 2 * tall, *E = p->work + 16 * square;
-    divide_few(p->factor + k * square, p->swaps + (size_t)k * n, n, r, s->M);
+    divide_few(p->factor + own * square, p->swaps + own * n, n, r, s->M);
     const int steady = !p->full && is_steady(p, k);
-    if (steady)
-        few_stages(p, n, r, k, before, s->M, y, y + tall, weighted);
-    else if (!p->full) { /* all stages once more */
+    if (steady) {
+        stacked(n, r, before, s->M, weighted, weighted + tall);
+        few_stages(p, n, r, k, weighted, y, y + tall);
+    } else if (!p->full) { /* all stages once more */
         spread(before, n, E);
         step(p, n, k, E);
     }
@@ -155,14 +169,20 @@ INLINE void back_few(
         double *out = stage ? s2 : s1;
         if (!out) continue;
         if (!steady) product_turned((stage ? p->stage2 : p->stage1) + place * 2 * square, s->M, 2 * n, n, r, y);
-        for (int i = 0; i < 2 * n; ++i)
-            for (int c = 0; c < r; ++c) {
-                double sum = 0.0;
-                for (int q = 0; q < r; ++q) sum += y[i * r + q] * s->C[q * r + c];
-                weighted[i * r + c] = sum;
-            }
-        at_nonzeros(p, n, r, y, weighted, out);
+        slopes_few(p, n, r, s->C, y, weighted, out);
     }
+}
+
+/* The same, faster where the columns are as few as they mostly are. */
+static void back_few_of(
+    const Passage *p, int n, int k, Slopes *s, const double *before, double *spare, double *s1, double *s2
+) {
+    if (s->few == 1)
+        back_few(p, n, 1, k, s, before, spare, s1, s2);
+    else if (s->few == 2)
+        back_few(p, n, 2, k, s, before, spare, s1, s2);
+    else
+        back_few(p, n, s->few, k, s, before, spare, s1, s2);
 }
 
 /* The same with all of P. */
@@ -239,12 +259,7 @@ static void back(
             continue;
         }
         const double *before = at ? p->after + (at - 1) * half : first;
-        if (s.few == 1)
-            back_few(p, n, 1, k, &s, before, spare, s1, s2);
-        else if (s.few == 2)
-            back_few(p, n, 2, k, &s, before, spare, s1, s2);
-        else
-            back_few(p, n, s.few, k, &s, before, spare, s1, s2);
+        back_few_of(p, n, k, &s, before, spare, s1, s2);
     }
     if (by_first) pack_slopes(&s, n, spare, by_first);
 }

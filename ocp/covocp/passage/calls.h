@@ -5,6 +5,7 @@
 #include "forward.h"
 #include "few.h"
 #include "back.h"
+#include "thin.h"
 #include "kept.h"
 #include "along.h"
 #include "transitions.h"
@@ -17,9 +18,9 @@ EXPORT void NAME(passage_forward)(
 ) {
     const Passage *p = &k->p;
     run(k, p->n, first, h1, h2, told, kicks);
-    const size_t half = (size_t)p->n * (p->n + 1) / 2, apart = p->lean ? 1 : p->every;
+    const size_t half = (size_t)p->n * (p->n + 1) / 2, each = p->every / apart(p);
     for (size_t k = 0; after && k < (size_t)p->ends; ++k)
-        memcpy(after + k * half, p->after + ((k + 1) * apart - 1) * half, sizeof(double) * half);
+        memcpy(after + k * half, p->after + ((k + 1) * each - 1) * half, sizeof(double) * half);
 }
 
 /* Slopes of seed . after by the arguments; those that are NULL are left out. Nonzero without memory. */
@@ -29,7 +30,10 @@ EXPORT int NAME(passage_reverse)(
 ) {
     if (!is_few(&k->p, k->p.n, seed) && keep_stages(k)) return 1;
     run(k, k->p.n, first, h1, h2, told, kicks);
-    back(&k->p, k->p.n, k->first, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+    if (k->p.thin)
+        back_thin(&k->p, k->p.n, k->first, k->known == 2 ? k->kicks : NULL, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+    else
+        back(&k->p, k->p.n, k->first, seed, by_first, by_h1, by_h2, by_told, by_kicks);
     return 0;
 }
 

@@ -58,17 +58,19 @@ INLINE void moved_by(const Passage *p, int n, const int r, const double *h, cons
     }
 }
 
-/* Y1 M and Y2 M (2n x r) of step k from M' (r x n) and the half-vector before it; spare: 2 n (r + 1). */
+/* [M; E M] (2n x r) from M' (r x n) and the half-vector of E; column: n. */
+INLINE void stacked(int n, const int r, const double *half, const double *M, double *RESTRICT both, double *column) {
+    for (int c = 0; c < r; ++c) {
+        by_half(half, n, M + c * n, column);
+        for (int i = 0; i < n; ++i) both[i * r + c] = M[c * n + i], both[(n + i) * r + c] = column[i];
+    }
+}
+
+/* Y1 M and Y2 M (2n x r) of step k from [M; E M] before it. */
 INLINE void few_stages(
-    const Passage *p, int n, const int r, int k, const double *before, const double *M, double *RESTRICT y1,
-    double *RESTRICT y2, double *spare
+    const Passage *p, int n, const int r, int k, const double *begin, double *RESTRICT y1, double *RESTRICT y2
 ) {
     const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
-    double *RESTRICT begin = spare, *RESTRICT column = begin + 2 * n * r;
-    for (int c = 0; c < r; ++c) {
-        by_half(before, n, M + c * n, column);
-        for (int i = 0; i < n; ++i) begin[i * r + c] = M[c * n + i], begin[(n + i) * r + c] = column[i];
-    }
     moved_by(p, n, r, h2, begin, y1);
     solve_few(p, n, r, factors_of(p, k), y1);
     moved_by(p, n, r, h1, y1, y2);

@@ -85,15 +85,15 @@ static int measures_much(const Passage *p, int k, const double *E) {
     return !(first <= MUCH && second <= MUCH); /* NaN too */
 }
 
-/* One step: E (n x n) becomes the one after it; what slopes need is kept.
+/* One step: E (n x n) becomes the one after it; what slopes need is kept. Whether the transition was made.
  *
  * [I; E] goes through the step as it is. Where much is measured the transition D itself is made, from which E's rounding
  * is apart: the errors of D [I; E] stay in proportion to what they come from.
  */
-static void step(const Passage *p, int n, int k, double *RESTRICT E) {
+static int step(const Passage *p, int n, int k, double *RESTRICT E) {
     const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
     double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
-    const size_t place = p->full ? (size_t)k : 0, own = p->lean ? 0 : (size_t)k;
+    const size_t place = p->full ? (size_t)k : 0, own = spot(p, k);
     double *RESTRICT Y1 = p->stage1 + place * m * n, *RESTRICT Y2 = p->stage2 + place * m * n;
     double *RESTRICT factor = p->factor + own * n * n;
     double *swaps = p->swaps + own * n;
@@ -121,6 +121,7 @@ static void step(const Passage *p, int n, int k, double *RESTRICT E) {
     eliminate(b, n, m, swaps);
     for (int i = 0; i < n; ++i) memcpy(factor + i * n, b + i * m, sizeof(double) * n);
     symmetric_part(b + n, m, n, a, E);
+    return transition;
 }
 
 /* Where readings compute: past what steps use. */
@@ -160,24 +161,35 @@ static void reading(Passage *p, int n, int j, double *RESTRICT E) {
 /* Whether what is after step k is wanted. */
 INLINE int at_end(const Passage *p, int k) { return (k + 1) % p->every == 0; }
 
+/* The lower triangle of E. */
+static void half_of(const double *RESTRICT E, int n, double *RESTRICT half) {
+    for (int j = 0, t = 0; j < n; ++j)
+        for (int i = j; i < n; ++i, ++t) half[t] = E[i * n + j];
+}
+
+/* What is done at step `at`, whose system is triangular where there is an order: E becomes the one after it.
+ * Whether it may be passed back by its system alone. */
+static int passed_step(Passage *p, int n, int at, double *E) {
+    const int place = p->place[at];
+    if (place >= 0) return !step(p, n, place, E) && is_steady(p, place);
+    reading(p, n, -1 - place, E);
+    return 0;
+}
+
 /* The passage from the first half-vector on, at p->h1, p->h2, p->told; kicks are added to what passes, NULL: nothing. */
 static void passes(Passage *p, int n, const double *first, const double *kicks) {
     const size_t half = (size_t)n * (n + 1) / 2;
     double *E = p->work + 14 * n * n;
+    const int between = apart(p);
     spread(first, n, E);
+    if (p->thin) memset(p->hard, 0, sizeof(int) * p->ends);
     for (int k = 0; k < p->count; ++k) {
-        const int place = p->place[k];
-        if (place < 0)
-            reading(p, n, -1 - place, E);
-        else {
-            factorize(p, place);
-            step(p, n, place, E);
-        }
-        const int wanted = at_end(p, k);
-        if (p->lean && !wanted) continue;
-        double *after = p->after + (p->lean ? k / p->every : k) * half;
-        for (int j = 0, t = 0; j < n; ++j)
-            for (int i = j; i < n; ++i, ++t) after[t] = E[i * n + j];
+        if (p->place[k] >= 0) factorize(p, p->place[k]);
+        const int simple = passed_step(p, n, k, E), wanted = at_end(p, k);
+        if (p->thin) p->hard[k / p->every] |= !simple;
+        if ((k + 1) % between) continue;
+        double *after = p->after + k / between * half;
+        half_of(E, n, after);
         if (!kicks || !wanted) continue;
         for (size_t t = 0; t < half; ++t) after[t] += kicks[k / p->every * half + t];
         spread(after, n, E);

@@ -41,15 +41,20 @@ static int here(
     return kicks ? !memcmp(k->kicks, kicks, half * p->ends) : k->known == 1;
 }
 
-/* Keep the stages of all steps from now on; nonzero without memory. */
+/* Keep the stages of all steps from now on, where it was thin all that is kept of them; nonzero without memory. */
 static int keep_stages(Kept *k) {
-    Passage *p = &k->p;
+    Passage *p = &k->p, whole = *p;
     if (p->full) return 0;
-    p->full = 1;
-    if (made(k, &k->stages, stages(p, NULL))) p->full = 0;
-    stages(p, p->full ? k->stages : k->reals);
+    whole.full = 1, whole.thin = 0;
+    if (made(k, &k->stages, stages(&whole, NULL) + (p->thin ? keeps(&whole, NULL) : 0))) return 1;
+    const size_t used = stages(&whole, k->stages);
+    if (p->thin)
+        keeps(&whole, k->stages + used);
+    else
+        whole = *p, whole.full = 1, stages(&whole, k->stages);
+    *p = whole;
     k->known = k->along = 0;
-    return !p->full;
+    return 0;
 }
 
 static void run(

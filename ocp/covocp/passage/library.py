@@ -13,12 +13,12 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 11
+VERSION = 12
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "passage_new": (_ADDRESS, (_ADDRESS, _WHOLE, _WHOLE)),
-    "passage_bytes": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
+    "passage_new": (_ADDRESS, (_ADDRESS, _WHOLE, _WHOLE, ctypes.c_size_t)),
+    "passage_bytes": (ctypes.c_size_t, (_ADDRESS, _WHOLE, ctypes.c_size_t)),
     "passage_held": (ctypes.c_size_t, (_ADDRESS,)),
     "passage_free": (None, (_ADDRESS,)),
     "passage_forward": (None, (_ADDRESS,) * 7),

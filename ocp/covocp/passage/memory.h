@@ -64,6 +64,7 @@ typedef struct {
     int lanes;        /* steps made triangular side by side: 1 or MOST_LANES */
     int full, brief;  /* the stages of all steps are kept; the factors of their systems, which for slopes of few entries
                        * suffice (few.h) */
+    int thin;         /* nothing is kept of the steps but the half-vectors that are wanted (thin.h), see `described_for` */
     const int *place; /* of each step among those that move, or -1 - that among those that read; of shape */
     const int *row, *col; /* nonzeros of H, column by column; of shape */
     const int *begin, *across, *which; /* the same row by row: places, columns, positions among them; of shape */
@@ -73,14 +74,24 @@ typedef struct {
     const int *order, *rank, *left, *right, *before, *facing, *behind;
     int *chosen;                  /* 2n to work in */
     int *good;                    /* whether factors are, of as many steps as there are in `factors` */
+    int *hard;                    /* where it is thin: the intervals between what is wanted whose steps are kept on the
+                                   * way back */
     const double *h1, *h2, *told; /* the point */
-    double *after;                /* half-vectors there, after all steps; where it is lean only those that are wanted */
+    double *after;                /* half-vectors there, after all steps; where it is lean or thin those that are wanted */
+    double *inside;               /* where it is thin: before each step of an interval */
     double *factors;              /* of the systems of all steps, or of those side by side */
-    double *factor, *swaps;       /* of every X', n x n, and the rows that were exchanged for each; of one where it is lean */
+    double *factor, *swaps;       /* of every X', n x n, and the rows that were exchanged for each; of one where it is lean,
+                                   * of those of one interval where it is thin */
     double *stage1, *stage2;      /* of every step, 2n x n, row by row; of one unless all are kept */
     double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */
     double *work, *sizes, *values; /* to work in; `sizes`: of the diagonal of a full system */
 } Passage;
+
+/* Where the factors of X' of step k are among those that are kept. */
+static size_t spot(const Passage *p, int k) { return p->lean ? 0 : (size_t)(p->thin ? k % p->every : k); }
+
+/* After how many of the steps, each time, a half-vector is kept. */
+static int apart(const Passage *p) { return p->lean || p->thin ? p->every : 1; }
 
 /* Numbers that tell of one reading. */
 static size_t telling(const Passage *p) { return (size_t)p->r * p->n + (size_t)p->r * (p->r + 1) / 2; }
@@ -97,5 +108,22 @@ static size_t stages(Passage *p, double *memory) {
     const size_t n = p->n, square = n * n, steps = p->full || !p->moves ? (size_t)p->moves : 1;
     size_t used = 0;
     p->stage1 = placed(memory, &used, steps * 2 * square), p->stage2 = placed(memory, &used, steps * 2 * square);
+    return used;
+}
+
+/* Numbers of the factors of the system of one step: shares before the diagonal, entries behind it, inverses of the diagonal. */
+static size_t factors_length(const Passage *p) { return p->order ? (size_t)2 * p->right[2 * p->n] + 2 * p->n : 0; }
+
+/* Places for what is kept of the steps, from `memory` on; their number. */
+static size_t keeps(Passage *p, double *memory) {
+    const size_t n = p->n, square = n * n, reads = p->reads, half = n * (n + 1) / 2;
+    const size_t steps = p->lean && p->moves ? 1 : (size_t)(p->thin ? p->every : p->moves);
+    size_t used = 0;
+    p->after = placed(memory, &used, half * (p->count / apart(p)));
+    if (p->thin) p->inside = placed(memory, &used, half * p->every);
+    p->factor = placed(memory, &used, steps * square), p->swaps = placed(memory, &used, steps * n);
+    if (p->brief) p->factors = placed(memory, &used, (size_t)p->moves * factors_length(p));
+    p->gain = placed(memory, &used, reads * p->r * n), p->keep = placed(memory, &used, reads * square);
+    p->inverse = placed(memory, &used, reads * p->r * p->r), p->reached = placed(memory, &used, reads * square);
     return used;
 }

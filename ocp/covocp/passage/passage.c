@@ -14,7 +14,7 @@
 #include "written.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 11; }
+EXPORT int passage_version(void) { return 12; }
 
 /* Whether this processor can take the functions whose names end in _newer. */
 EXPORT int passage_newer(void) {
@@ -33,25 +33,31 @@ EXPORT void passage_free(Kept *k) {
     free(k);
 }
 
-/* Tells a passage its shape, and what is kept of its steps. */
-static void described_for(Passage *p, const int *shape, int lean) {
+/* Intervals from which on it pays to keep nothing between them. */
+enum { FEWEST_ENDS = 8 };
+
+/* Tells a passage its shape, and what is kept of its steps: the factors of X' unless they have more than `most` numbers
+ * together. */
+static void described_for(Passage *p, const int *shape, int lean, size_t most) {
     described(p, shape);
-    p->lean = lean, p->lanes = MOST_LANES, p->brief = !lean && p->order;
+    const int much = (double)p->moves * p->n * p->n > (double)most && p->ends >= FEWEST_ENDS;
+    p->lean = lean, p->lanes = MOST_LANES;
+    p->thin = !lean && p->order && much, p->brief = !lean && p->order && !much;
 }
 
 /* A passage of a shape of `length` numbers; NULL where there is no memory. `lean`: for values alone. */
-EXPORT Kept *passage_new(const int *shape, int length, int lean) {
+EXPORT Kept *passage_new(const int *shape, int length, int lean, size_t most) {
     Kept *k = calloc(1, sizeof *k);
     if (!k) return NULL;
     Passage *p = &k->p;
-    described_for(p, shape, lean);
+    described_for(p, shape, lean, most);
     k->whole = room((size_t)length + counts(p, NULL), sizeof(int));
     if (!k->whole || made(k, &k->reals, stages(p, NULL) + keeps(p, NULL) + works(p, NULL) + numbers(p))) {
         passage_free(k);
         return NULL;
     }
     memcpy(k->whole, shape, sizeof(int) * length);
-    described_for(p, k->whole, lean);
+    described_for(p, k->whole, lean, most);
     counts(p, k->whole + length);
     const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = (size_t)p->nnz * p->moves;
     double *at = k->reals + stages(p, k->reals); /* where `keep_stages` finds them */
@@ -60,7 +66,7 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean) {
     k->first = at, k->h1 = k->first + half, k->h2 = k->h1 + entries;
     k->told = k->h2 + entries, k->kicks = k->told + telling(p) * p->reads;
     p->h1 = k->h1, p->h2 = k->h2, p->told = k->told;
-    if (!lean && !p->brief && keep_stages(k)) {
+    if (!lean && !p->brief && !p->thin && keep_stages(k)) {
         passage_free(k);
         return NULL;
     }
@@ -68,10 +74,10 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean) {
 }
 
 /* Bytes of such a passage before slopes or tangents ask for more. */
-EXPORT size_t passage_bytes(const int *shape, int lean) {
+EXPORT size_t passage_bytes(const int *shape, int lean, size_t most) {
     Passage p;
-    described_for(&p, shape, lean);
-    p.full = !lean && !p.brief;
+    described_for(&p, shape, lean, most);
+    p.full = !lean && !p.brief && !p.thin;
     return sizeof(double) * (stages(&p, NULL) + keeps(&p, NULL) + works(&p, NULL) + numbers(&p));
 }
 

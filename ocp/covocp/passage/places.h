@@ -21,19 +21,8 @@ static size_t counts(Passage *p, int *memory) {
     const size_t m = 2 * (size_t)p->n, good = p->brief ? (size_t)p->moves : (size_t)p->lanes;
     p->chosen = memory;
     if (memory) p->good = memory + m;
-    return m + good;
-}
-
-/* Places for what is kept of the steps, from `memory` on; their number. */
-static size_t keeps(Passage *p, double *memory) {
-    const size_t n = p->n, square = n * n, reads = p->reads, steps = p->lean && p->moves ? 1 : (size_t)p->moves;
-    size_t used = 0;
-    p->after = placed(memory, &used, n * (n + 1) / 2 * (p->lean ? p->ends : p->count));
-    p->factor = placed(memory, &used, steps * square), p->swaps = placed(memory, &used, steps * n);
-    if (p->brief) p->factors = placed(memory, &used, (size_t)p->moves * factors_length(p));
-    p->gain = placed(memory, &used, reads * p->r * n), p->keep = placed(memory, &used, reads * square);
-    p->inverse = placed(memory, &used, reads * p->r * p->r), p->reached = placed(memory, &used, reads * square);
-    return used;
+    if (memory && p->thin) p->hard = p->good + good;
+    return m + good + (p->thin ? (size_t)p->ends : 0);
 }
 
 /* Places to work in, from `memory` on; their number. */

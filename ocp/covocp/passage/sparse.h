@@ -7,9 +7,6 @@
  * S does not depend on the covariance: `lanes` steps are made triangular side by side, entry by entry.
  */
 
-/* Numbers of the factors of one step: shares before the diagonal, entries behind it, inverses of the diagonal. */
-static size_t factors_length(const Passage *p) { return p->order ? (size_t)2 * p->right[2 * p->n] + 2 * p->n : 0; }
-
 /* Where those of step k are. */
 static double *factors_of(const Passage *p, int k) {
     return p->factors + (size_t)(p->brief ? k : k % p->lanes) * factors_length(p);

@@ -18,7 +18,10 @@ from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
-KEPT_BYTES = 20_000_000
+KEPT_BYTES = 12_000_000
+
+# Numbers in the factors of all X above which a passage keeps nothing but the half-vectors that are wanted.
+MOST_FACTORS = 1_000_000
 
 Given = Mapping[str, Any]
 # Where numbers lie, None where there are none.
@@ -202,7 +205,7 @@ class _Sweep(Node):
         self.ends = count // every
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
         self._shape = shape(size, pattern, count, reads, height, every)
-        self.bytes = int(needed()["passage_bytes"](self._shape.ctypes.data, int(lean)))
+        self.bytes = int(needed()["passage_bytes"](self._shape.ctypes.data, int(lean), MOST_FACTORS))
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
         sizes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
@@ -214,7 +217,7 @@ class _Sweep(Node):
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
-        memory = needed()["passage_new"](self._shape.ctypes.data, self._shape.size, int(self._lean))
+        memory = needed()["passage_new"](self._shape.ctypes.data, self._shape.size, int(self._lean), MOST_FACTORS)
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)

@@ -143,7 +143,7 @@ def _in_runs(
     make: Callable[[Any, int], tuple[list[Any], Run]], first: ca.DM, columns: tuple[Any, ...], every: int
 ) -> Any:
     """What `_compiled` gives of numbers, in short runs where the matrices are large: H of all steps takes memory."""
-    length = max(NUMERIC_ENTRIES // (8 * first.shape[0]), 1) * every
+    length = max(NUMERIC_ENTRIES // (8 * first.shape[0] * every), 1) * every
     values = [first]
     for own in zip(*(ca.horzsplit(column, length) for column in columns), strict=True):
         matrices, run = make(own, own[0].shape[1])

@@ -224,9 +224,10 @@ def passages(
     if statement.summed:
         first = e0[statement.entries(statement.summed)]
         groups.append(_gathered(statement, mesh, first, columns, groups[0], _of(kicks, statement, statement.summed)))
-    e, begins, halves = (in_order(statement, *parts) for parts in zip(*groups, strict=True))
+    e, halves = (in_order(statement, *(group[k] for group in groups)) for k in (0, 2))
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
+    begins = in_order(statement, *(group[1] for group in groups))
     return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))
 
 
@@ -296,8 +297,9 @@ def _forward(
         first, later = first + kicks[:, 0], kicks[:, 1:]
     arrived, passed = sequence(statement.ahead, first, columns, later)
     each = passed.shape[1] // n
-    nodes = ca.horzcat(first, passed[:, each - 1 :: each])
-    return nodes, nodes[:, :n], arrived
+    nodes = ca.horzcat(first, passed if each == 1 else passed[:, each - 1 :: each])
+    wanted = statement.running_uses_matrices or statement.summed  # numbers would take memory
+    return nodes, nodes[:, :n] if wanted else None, arrived
 
 
 def _gathered(
