@@ -12,7 +12,6 @@ good enough, and is (h - q1)^2 but for a rest that vanishes as exp(-2 h (h - q1)
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
@@ -20,6 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

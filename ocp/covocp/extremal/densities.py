@@ -8,13 +8,13 @@ each other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.checks import check_density
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.short_repr import short_repr

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.arguments import checked, one_of
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import MissingAttributeError, ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import chain
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import Interrupted, OutsideDomainError, ProblemError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress

@@ -10,12 +10,13 @@ and the nominal, is the solver's.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, SolveError, without_warnings
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct, pack, unpack
