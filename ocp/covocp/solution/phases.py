@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +24,8 @@ from covocp.statement.chain import Link
 from covocp.statement.names import name_of, sizes_of, unknown_name
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import matplotlib.figure
 
 # Residual where phases meet from which on the printout worries about it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import casadi as ca
@@ -17,27 +16,19 @@ from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, read_only, smallest_eigenvalue
-from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
-from covocp.extremal.links import Within
-from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
-from covocp.extremal.optimality import Optimality, assess, identities, mention_saddle
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
-from covocp.extremal.phase_loops import PhaseLoop
 from covocp.extremal.polynomials import Dense
-from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.solution.chances import Reached, reached
 from covocp.solution.costs import identity_of_costs, split_cost
 from covocp.solution.covariances import all_covariances, are_semidefinite, covariance_between
-from covocp.solution.duals import costate_of, multiplier_of
-from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
 from covocp.solution.patience import longest
 from covocp.solution.reading import by_name, expression_values, name_in, other_loop
@@ -51,7 +42,15 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import matplotlib.figure
+
+    from covocp.extremal.links import Within
+    from covocp.extremal.mean_effect import MeanEffect
+    from covocp.extremal.optimality import Optimality
+    from covocp.extremal.phase_loops import PhaseLoop
+    from covocp.solution.fingerprint import Fingerprint
 
 
 @methods_one_at_a_time
@@ -231,6 +230,8 @@ class Solution:
     @cached
     def optimality(self) -> Optimality:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
+        from covocp.extremal.optimality import assess, identities, mention_saddle
+
         if self.stored_optimality is not None:
             return self.stored_optimality
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
@@ -252,6 +253,8 @@ class Solution:
     @cached
     def mean_effect(self) -> MeanEffect | None:
         """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
+        from covocp.extremal.mean_effect import mean_effect, remembered
+
         if self.loop is None or self.statement is None or self.within is not None:
             return remembered(self.stats)
         return mean_effect(self.extremal, self.loop)
@@ -359,6 +362,8 @@ class Solution:
         Raises:
             ProblemError: where the symbol is neither.
         """
+        from covocp.solution.duals import costate_of
+
         return costate_of(self, symbol)
 
     def multiplier(self, key: Given) -> Array:
@@ -378,6 +383,8 @@ class Solution:
         Raises:
             ProblemError: where there is no such constraint or symbol.
         """
+        from covocp.solution.duals import multiplier_of
+
         return multiplier_of(self, key)
 
     @property
@@ -439,6 +446,8 @@ class Solution:
 
     def passed_limits(self, points: int = 10) -> tuple[Passed, ...]:
         """What `check_path` finds, with the share of the limit and the time, the worst first."""
+        from covocp.extremal.spread_limits import passed_by_spread, spread_names
+
         if not limited(self.extremal):
             return ()
         path = self.extremal.statement.path
@@ -492,6 +501,8 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the same summary, and the figure."""
+        from covocp.base.pages import as_html
+
         return as_html(later("solution.report").sections(self), later("plot.embedding").embedded(self.plot))
 
     @property

@@ -15,7 +15,6 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
-from covocp.transcription.detours import detours
 from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.mirrored import other_sides
@@ -108,6 +107,8 @@ def _ways_round(
     Where nothing lies on the bent run and on the unbent one, but between them, the unbent one is a way as well. Starts
     that follow a guess, or that a feedback holds, stay as they are.
     """
+    from covocp.transcription.detours import detours
+
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
     if not plain or own.held or own.unbent is None or not curved_rows(statement):
         return
