@@ -66,13 +66,14 @@ def solve(
             (carries the best solution without it).
         Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
     """
-    from covocp.problem.phases import Phases
+    if not isinstance(problem, Problem):
+        from covocp.problem.phases import Phases
 
-    if not isinstance(problem, Problem) and isinstance(problem, Phases):
-        check_method(method)
-        run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
-        run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
-        return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
+        if isinstance(problem, Phases):
+            check_method(method)
+            run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
+            run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
+            return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
     random = multistart(guess, options)
     extra: dict[str, Any] = {} if random is None else dict(zip(("starts", "seed"), random, strict=True))
     solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)

@@ -86,9 +86,6 @@ def _off_saddle(
     prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess | None
 ) -> Outcome:
     """What `away_from_saddle` returns."""
-    from covocp.extremal.optimality import mention_saddle
-    from covocp.extremal.worth import HARDLY, worth_telling
-
     if not outcome.converged or reporter.stop or not (start is None or _suspicious(outcome, start)):
         return outcome
     left, longer = reporter.left[0], longest(outcome.stats)
@@ -96,6 +93,9 @@ def _off_saddle(
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
     if curvature is None or curvature.verdict != "saddle":
         return outcome
+    from covocp.extremal.optimality import mention_saddle
+    from covocp.extremal.worth import HARDLY, worth_telling
+
     candidates = []
     for sign in ESCAPES:
         moved = _displaced(outcome.extremal, curvature, sign)

@@ -363,10 +363,10 @@ class Solver(ClassicalRuns):
         Its steps are looked at always, its nodes where it takes no more time than what else is looked at, more is
         uncertain at the start than before, or the times at which the model jumps are others.
         """
-        from covocp.solving.suited_mesh import beginning, other_nodes, suits
-
         if np.array_equal(values, self._values):
             return
+        from covocp.solving.suited_mesh import beginning, other_nodes, suits
+
         mesh, begin = self._prepared.mesh, beginning(*self._ungraded, values)
         borne = beginning(*self._ungraded, self._values) if self._borne is None else self._borne
         on_nodes = mesh.step == "rk4" and bool(self.statement.matrices)  # the steps depend on them
@@ -454,10 +454,10 @@ class Solver(ClassicalRuns):
 
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
-        from covocp.solving.refined_meshes import remade
-
         if not self._remade or reporter.stop:
             return outcome
+        from covocp.solving.refined_meshes import remade
+
         runs = refining.ProblemRuns(self._solved, values, self._by, self._ready, reporter)
         found = remade(runs.measured(self._options, self._prepared, outcome, refining.unseen(self._own)), runs)
         assert isinstance(found.outcome, Outcome)

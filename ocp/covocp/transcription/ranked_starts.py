@@ -107,8 +107,6 @@ def _ways_round(
     Where nothing lies on the bent run and on the unbent one, but between them, the unbent one is a way as well. Starts
     that follow a guess, or that a feedback holds, stay as they are.
     """
-    from covocp.transcription.detours import detours
-
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
     if not plain or own.held or own.unbent is None or not curved_rows(statement):
         return
@@ -123,6 +121,8 @@ def _ways_round(
         if met:
             yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
         return
+    from covocp.transcription.detours import detours
+
     roots = tried[:-1] if any(through[:-1]) else tried
     coarse = coarse_mesh(statement, mesh, tuple(parameters), DETOURS)
     least = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
