@@ -26,11 +26,12 @@ from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.polynomials import Dense
+from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.solution.chances import Reached, reached
 from covocp.solution.costs import identity_of_costs, split_cost
 from covocp.solution.covariances import all_covariances, are_semidefinite, covariance_between
+from covocp.solution.duals import costate_of, multiplier_of
 from covocp.solution.origin import Origin, origin_of
-from covocp.solution.patience import longest
 from covocp.solution.reading import by_name, expression_values, name_in, other_loop
 from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
@@ -230,17 +231,9 @@ class Solution:
     @cached
     def optimality(self) -> Optimality:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
-        from covocp.extremal.optimality import assess, identities, mention_saddle
+        from covocp.solution.assessed import optimality_of
 
-        if self.stored_optimality is not None:
-            return self.stored_optimality
-        known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
-        if not self.optimised:
-            return identities(self.extremal, *known)
-        found = assess(self.extremal, self.costates, *known, self.within, longest(self.stats))
-        if self.converged:
-            mention_saddle(found.curvature)
-        return found
+        return optimality_of(self)
 
     @property
     def cost_identity(self) -> float | None:
@@ -253,11 +246,9 @@ class Solution:
     @cached
     def mean_effect(self) -> MeanEffect | None:
         """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
-        from covocp.extremal.mean_effect import mean_effect, remembered
+        from covocp.solution.assessed import mean_effect_of
 
-        if self.loop is None or self.statement is None or self.within is not None:
-            return remembered(self.stats)
-        return mean_effect(self.extremal, self.loop)
+        return mean_effect_of(self)
 
     @cached
     def smallest_eigenvalue(self) -> float:
@@ -362,8 +353,6 @@ class Solution:
         Raises:
             ProblemError: where the symbol is neither.
         """
-        from covocp.solution.duals import costate_of
-
         return costate_of(self, symbol)
 
     def multiplier(self, key: Given) -> Array:
@@ -383,8 +372,6 @@ class Solution:
         Raises:
             ProblemError: where there is no such constraint or symbol.
         """
-        from covocp.solution.duals import multiplier_of
-
         return multiplier_of(self, key)
 
     @property
@@ -446,8 +433,6 @@ class Solution:
 
     def passed_limits(self, points: int = 10) -> tuple[Passed, ...]:
         """What `check_path` finds, with the share of the limit and the time, the worst first."""
-        from covocp.extremal.spread_limits import passed_by_spread, spread_names
-
         if not limited(self.extremal):
             return ()
         path = self.extremal.statement.path
