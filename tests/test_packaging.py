@@ -110,7 +110,7 @@ def test_import_loads_little_that_a_plain_solve_does_not_need(tmp_path):
         "loaded = set(sys.modules) - before\n"
         "print(sorted({'statistics', 'fractions', 'html', 'pathlib', 'tempfile'} & loaded))\n"
         "seldom = ('extremal.optimality', 'extremal.curvature', 'problem.attitude', 'problem.description',\n"
-        "  'base.pages', 'problem.phases', 'solution.phases', 'solution.fingerprint', 'transcription.detours', 'blocks.so3')\n"
+        "  'base.pages', 'problem.phases', 'solution.phases', 'solution.fingerprint', 'transcription.detours')\n"
         "print([name for name in seldom if f'covocp.{name}' in loaded])\n"
         "from covocp.models import mass_chain\n"
         "import covocp.solvers.ipopt\n"
