@@ -28,7 +28,6 @@ Regulation, cost of the true state's feedback over the optimal cost, which is 26
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -36,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import riccati
 

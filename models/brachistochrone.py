@@ -11,14 +11,13 @@ proportion to time: T = 1.8016 s. There is no covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

@@ -10,12 +10,11 @@ l = 1/9: J = 4. There is no covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

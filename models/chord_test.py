@@ -11,12 +11,11 @@ Optimal: p = -2 - t, u + u^3 = 2 + t, J = -1.788321888. The costates do not depe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

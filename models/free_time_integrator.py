@@ -13,12 +13,11 @@ needs + dx_q/dt(T) dT; [D-7] to [D-9] and [D-14] change accordingly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

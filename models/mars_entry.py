@@ -41,7 +41,6 @@ factor 1/2 is too many.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -49,6 +48,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

@@ -16,14 +16,13 @@ Errata: in [3.4-9] read dP/dt, in [3.4-10] P(1) = 0, in [3.4-28] dp/dt.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

@@ -14,7 +14,6 @@ arrives (docs/blocks/peak_seeking.md has both, with their shares).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ import numpy.typing as npt
 
 import covocp as co
 from covocp.base.arguments import checked, is_number, one_of, positive, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import kalman, peak_seeking
 from covocp.models import designed_excitation

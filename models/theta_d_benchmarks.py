@@ -25,7 +25,6 @@ The arctangent and rational systems are converse problems: f is made for a chose
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -33,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import riccati
 

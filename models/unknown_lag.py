@@ -42,7 +42,6 @@ classical nominal is even the better one (1.78 against 2.03). Erratum: in [6.12-
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,6 +49,7 @@ import numpy.typing as npt
 from numpy.polynomial import legendre
 
 import covocp as co
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered, Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, NO_SIZE, ROUNDED, VIOLATION, Residuals, complementary
 from covocp.base.short_repr import short_repr

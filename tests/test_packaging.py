@@ -101,6 +101,29 @@ def test_import_loads_neither_scipy_nor_the_laws(tmp_path):
     assert found.stdout.split() == ["[]", "covocp.blocks.theta_d"]
 
 
+def test_import_loads_little_that_a_plain_solve_does_not_need(tmp_path):
+    """And the solve nothing but its method: what few problems need is loaded where it is needed."""
+    found = run_python(
+        "import sys, casadi, numpy\n"
+        "before = set(sys.modules)\n"
+        "import covocp as co\n"
+        "loaded = set(sys.modules) - before\n"
+        "print(sorted({'statistics', 'fractions', 'html', 'pathlib', 'tempfile'} & loaded))\n"
+        "seldom = ('extremal.optimality', 'extremal.curvature', 'problem.attitude', 'problem.description',\n"
+        "  'base.pages', 'problem.phases', 'solution.phases', 'solution.fingerprint', 'transcription.detours')\n"
+        "print([name for name in seldom if f'covocp.{name}' in loaded])\n"
+        "from covocp.models import mass_chain\n"
+        "import covocp.solvers.ipopt\n"
+        "before = set(sys.modules)\n"
+        "co.solve(mass_chain.problem(masses=1), progress=False, intervals=30)\n"
+        "print([name for name in seldom if f'covocp.{name}' in set(sys.modules) - before])\n"
+        "print(co.evaluate.__name__, co.Phases.__name__)",
+        tmp_path,
+    )
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.splitlines() == ["[]", "[]", "[]", "evaluate Phases"]
+
+
 def test_a_solve_loads_nothing_that_takes_as_long(tmp_path):
     """With necessary conditions, on a mesh that refines itself, with and without covariances, under feedback."""
     found = run_python(

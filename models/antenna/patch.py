@@ -10,7 +10,6 @@ analytic in u and v. Behind the patch it is multiplied by exp(-(w / 0.15)^2), wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from covocp.base.arguments import check_argument, one_of, positive
+from covocp.base.dataclass import dataclass
 from covocp.blocks import so3
 from covocp.blocks.rotation_series import sine, versine
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import attitude_seeking, so3
 from covocp.models.antenna.patch import Patch

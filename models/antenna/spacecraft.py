@@ -8,7 +8,6 @@ with the wheel speeds r and the torque tau of the wheels on the body, section 8 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from covocp.base.arguments import check_argument, positive
+from covocp.base.dataclass import dataclass
 from covocp.blocks import so3
 from covocp.blocks.values import weight
 

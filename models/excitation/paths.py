@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -11,6 +10,7 @@ import numpy.typing as npt
 
 import covocp as co
 from covocp.base.arguments import checked, positive, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import peak_seeking
 

@@ -31,7 +31,6 @@ Conference 2010, which prints neither aircraft nor weights: the weights are chos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +38,7 @@ import numpy.typing as npt
 import scipy.linalg
 
 from covocp.base.arguments import check_argument, checked, is_number, positive
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks import riccati
 

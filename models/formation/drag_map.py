@@ -25,7 +25,6 @@ of the continuation is that it leads back. Derivatives jump at the border. `Drag
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -35,6 +34,7 @@ import numpy.typing as npt
 
 import covocp as co
 from covocp.base.arguments import checked, one_of, positive
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.models.formation import vortex_lattice
 

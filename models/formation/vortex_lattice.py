@@ -30,7 +30,6 @@ J. N. Hallock, Chicago monostatic acoustic vortex sensing system, vol. IV, DOT-T
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +37,7 @@ import numpy.typing as npt
 
 import covocp as co
 from covocp.base.arguments import check_argument, checked, is_number, positive, share, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]

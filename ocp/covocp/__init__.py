@@ -36,10 +36,8 @@ from covocp.base.errors import SolveError as SolveError
 from covocp.problem.builder import Problem as Problem
 from covocp.problem.declarations import Free as Free
 from covocp.problem.declarations import Gain as Gain
-from covocp.problem.phases import Phases as Phases
 from covocp.solution.solution import Solution as Solution
 from covocp.solving.elsewhere import movable as movable
-from covocp.solving.evaluation import evaluate as evaluate
 from covocp.solving.methods import methods as methods
 from covocp.solving.once import solve as solve
 from covocp.solving.solver import Solver as Solver
@@ -96,6 +94,7 @@ if TYPE_CHECKING:
     from covocp.export import CPackage as CPackage
     from covocp.export import export_c as export_c
     from covocp.passage.library import build_info as build_info
+    from covocp.problem.phases import Phases as Phases
     from covocp.simulation import MonteCarlo as MonteCarlo
     from covocp.simulation import PhasesMonteCarlo as PhasesMonteCarlo
     from covocp.simulation import simulate as simulate
@@ -106,6 +105,7 @@ if TYPE_CHECKING:
     from covocp.solution.phases import PhasesSolution as PhasesSolution
     from covocp.solving.comparison import Comparison as Comparison
     from covocp.solving.comparison import compare as compare
+    from covocp.solving.evaluation import evaluate as evaluate
     from covocp.solving.loading import load as load
 else:
     # What is done with a solution is imported when it is first asked for: so the import stays as light as CasADi's,
@@ -115,7 +115,9 @@ else:
         "certify": "covocp.analysis.certificate",
         "Comparison": "covocp.solving.comparison",
         "compare": "covocp.solving.comparison",
+        "evaluate": "covocp.solving.evaluation",
         "load": "covocp.solving.loading",
+        "Phases": "covocp.problem.phases",
         "build_info": "covocp.passage.library",
         "CPackage": "covocp.export",
         "export_c": "covocp.export",

@@ -10,7 +10,7 @@ and free initial values of all phases at once.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 from scipy import sparse
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

@@ -15,12 +15,12 @@ K. Ito, K. Kunisch, SIAM J. Optimization 13, 2003); the multipliers of the bound
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

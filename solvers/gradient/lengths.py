@@ -6,10 +6,9 @@ matrices are those of the mesh, which the user may have given: a run that they m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement

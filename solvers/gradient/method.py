@@ -25,7 +25,7 @@ The stop test does not depend on W; see `prepare`.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from scipy.sparse.linalg import splu
 
 from covocp.base.arguments import checked, one_of, positive, share, whole
 from covocp.base.checks import as_number
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array

@@ -6,11 +6,12 @@ predicted; see `covocp.solvers.gradient` for what is beyond the source.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array

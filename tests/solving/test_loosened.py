@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import covocp as co
-from covocp.solving import gain_ways, solver
+from covocp.solving import gain_ways, other_ways, solver
 from covocp.solving.loosened import PATIENCE_OF_STEPS
 
 
@@ -49,7 +49,7 @@ def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
 def test_a_step_that_raises_leaves_the_run_that_failed(monkeypatch):
     """As CasADi does where a linear system is singular."""
     monkeypatch.setattr(solver, "PATIENCE", 12)
-    monkeypatch.setattr(solver, "other_ways", lambda *_: iter(()))
+    monkeypatch.setattr(other_ways, "other_ways", lambda *_: iter(()))
     made_ready = solver.made_ready
 
     class Raises:

@@ -153,7 +153,7 @@ def test_numbers_without_a_value_end_no_solve(monkeypatch):
     def fails(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(ranked_starts, "detours", fails)
+    monkeypatch.setattr("covocp.transcription.detours.detours", fails)
     problem, x, _ = walk()
     problem.subject_to(apart(x, 5.0, 1.0), lower=RADIUS**2)
     assert solve(problem, intervals=30).converged
@@ -279,7 +279,7 @@ CONVEX = {
 
 @pytest.mark.parametrize("name", CONVEX)
 def test_what_has_one_side_is_left_alone(name, monkeypatch):
-    monkeypatch.setattr(ranked_starts, "detours", lambda *a: pytest.fail("other sides were looked for"))
+    monkeypatch.setattr("covocp.transcription.detours.detours", lambda *a: pytest.fail("other sides were looked for"))
     problem, x, u = walk()
     value, upper = CONVEX[name](x, u)
     problem.subject_to(value, upper=upper)
@@ -287,7 +287,7 @@ def test_what_has_one_side_is_left_alone(name, monkeypatch):
 
 
 def test_nothing_is_looked_for_where_the_start_runs_free(monkeypatch):
-    monkeypatch.setattr(ranked_starts, "detours", lambda *a: pytest.fail("other sides were looked for"))
+    monkeypatch.setattr("covocp.transcription.detours.detours", lambda *a: pytest.fail("other sides were looked for"))
     problem, x, _ = walk()
     problem.subject_to(apart(x, 5.0, 30.0), lower=RADIUS**2)
     assert solve(problem, intervals=30).converged

@@ -17,7 +17,7 @@ the numbers change from one to the other is their error, and part of the toleran
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import casadi as ca
@@ -30,6 +30,7 @@ from covocp.analysis.mesh_bound import both_ends, divided, mesh_residual
 from covocp.analysis.reduction import Reduction, parts, resolved
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import check_kind
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, standard_deviations, unpack
 from covocp.base.pages import lines_as_html
 from covocp.base.progress import Progress

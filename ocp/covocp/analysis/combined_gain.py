@@ -13,12 +13,13 @@ how much is gained truly along d is seen by evaluating the expected cost at a fe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
 from covocp.base.checks import check_kind
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, SolveError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct

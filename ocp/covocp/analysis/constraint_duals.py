@@ -8,7 +8,6 @@ asked of the control at the initial or the terminal time alone binds no such con
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from covocp.analysis.conditions import condition
 from covocp.analysis.stages import Stages
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal

@@ -10,7 +10,6 @@ how far a control that costs no more can be.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from covocp.analysis.conditions import end_slopes, terminal_cost, terminal_weigh
 from covocp.analysis.constraint_duals import duals, terminal_rows
 from covocp.analysis.reduction import Reduction
 from covocp.analysis.stages import Stages
+from covocp.base.dataclass import dataclass
 from covocp.base.krylov import Krylov, krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

@@ -17,12 +17,13 @@ they make of Lambda is still exactly quadratic in the values of the control.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.gains import weighted
 from covocp.base.matrices import Array, unpack

@@ -8,11 +8,10 @@ piecewise linear and the piecewise constant ones, and come close to any control 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from covocp.analysis.reduction import Reduction
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 

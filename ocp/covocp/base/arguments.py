@@ -69,7 +69,8 @@ def checked(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
 
 def checked_class(cls: C) -> C:
     """The class, which refuses arguments that it does not know, and says which it needs."""
-    setattr(cls, "__init__", checked()(vars(cls)["__init__"]))  # noqa: B010 - mypy takes it for a slip otherwise
+    of: Any = cls
+    of.__init__ = checked()(of.__init__)
     return cls
 
 

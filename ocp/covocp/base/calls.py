@@ -73,7 +73,8 @@ def _with_name(owner: str, by_position: list[str], args: tuple[Any, ...], kwargs
 def _otherwise(function: Callable[..., Any]) -> str:
     """What to do with a name that no other one resembles: the class of a method may take it when it is made."""
     owner, _, method = function.__qualname__.rpartition(".")
-    made = vars(getattr(sys.modules.get(function.__module__), owner, object)).get("__init__")
+    kind = getattr(sys.modules.get(function.__module__), owner, object)
+    made = kind.__init__ if "__init__" in vars(kind) and kind is not object else None
     takes_options = made is not None and any(
         p.kind == Parameter.VAR_KEYWORD for p in signature(made).parameters.values()
     )

@@ -12,19 +12,17 @@ good enough, and is (h - q1)^2 but for a rest that vanishes as exp(-2 h (h - q1)
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from statistics import NormalDist
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 
-NORMAL = NormalDist()
 # The rest of U is left out where it is smaller than exp(-this), relative to its largest value.
 VANISHED = 38.0
 # Terms of the sum at most, and the relative size of the first one that is left out.
@@ -39,7 +37,14 @@ def tail(x: float) -> float:
 
 def quantile(probability: float) -> float:
     """The number that a standard normal one stays below with this probability, exact also close to one."""
-    return -NORMAL.inv_cdf(1.0 - probability) if probability > 0.5 else NORMAL.inv_cdf(probability)
+    return -_below(1.0 - probability) if probability > 0.5 else _below(probability)
+
+
+def _below(share: float) -> float:
+    """The number that a standard normal one stays below with this probability."""
+    from statistics import NormalDist  # here: few problems ask for it, and it takes as long as many modules of covocp
+
+    return NormalDist().inv_cdf(share)
 
 
 def inside(y: Array, s: Array, lower: Array | float, upper: Array | float) -> Array:
@@ -73,7 +78,7 @@ def margin(y: Array, s: Array, lower: float, upper: float, probability: float) -
         return np.asarray(y - lower - one * s)
     d = np.abs(y - 0.5 * (lower + upper))
     # The width that is needed is between those of one tail and of two tails that are equal at the nearer limit.
-    low, high = np.maximum(d + one * s, 0.0), d - NORMAL.inv_cdf(0.5 * (1.0 - probability)) * s
+    low, high = np.maximum(d + one * s, 0.0), d - _below(0.5 * (1.0 - probability)) * s
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -123,7 +128,7 @@ class TwoSided:
 @lru_cache(maxsize=64)
 def two_sided(probability: float) -> TwoSided:
     """The function U of a probability."""
-    one, two = quantile(probability), -NORMAL.inv_cdf(0.5 * (1.0 - probability))
+    one, two = quantile(probability), -_below(0.5 * (1.0 - probability))
     top = max(0.5 * (one + math.sqrt(one**2 + 2.0 * VANISHED)), two + 1.0)
     points = np.cos(np.pi * (np.arange(TERMS) + 0.5) / TERMS)
     values = np.array([_rest(probability, one, 0.5 * (two + top + x * (top - two))) for x in points])

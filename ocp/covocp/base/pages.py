@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+
+from covocp.base.dataclass import dataclass
 
 # Columns of plain text.
 WIDTH = 100

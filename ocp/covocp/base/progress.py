@@ -7,10 +7,10 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
 
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 # The largest violation has fallen where it is less than this share of the least one before; what it is at most, in the

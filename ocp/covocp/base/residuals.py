@@ -18,10 +18,11 @@ it, and runs go on to what is small of the cost itself as long as that helps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 
 # Largest residuals of a converged point. To first order it is this share of its cost away from a stationary one, mostly

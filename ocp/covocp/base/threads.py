@@ -118,6 +118,8 @@ def methods_one_at_a_time(cls: C) -> C:
     for name, value in list(vars(cls).items()):
         if name.startswith("_") and name not in SHOWN:
             continue
+        if name == "__init__":
+            value = getattr(cls, name)  # a dataclass compiles it when it is asked for
         if isinstance(value, FunctionType):
             setattr(cls, name, briefly(value) if name in BRIEF else one_at_a_time(value))
         elif isinstance(value, property) and value.fget is not None:

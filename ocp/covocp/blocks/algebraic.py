@@ -6,7 +6,6 @@ Everything here is numeric (scipy); a Lyapunov equation, being linear, may also 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import apply

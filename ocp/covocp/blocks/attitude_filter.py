@@ -6,7 +6,6 @@ the corrections of docs/blocks/attitude_seeking.md; the equations are numbered a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, half_length, standard_deviations
 from covocp.base.short_repr import short_repr

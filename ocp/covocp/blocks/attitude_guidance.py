@@ -7,7 +7,6 @@ the corrections of docs/blocks/attitude_seeking.md; the equations are numbered a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, Unpack
 
 import casadi as ca
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import checked, one_of, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices
 from covocp.base.short_repr import short_repr

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import Kind, check_argument, is_number, optional, positive, truth, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, warn_user
 from covocp.base.short_repr import short_repr
 from covocp.blocks.attitude_filter import AXES, FilterSettings

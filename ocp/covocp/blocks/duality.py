@@ -9,10 +9,10 @@ S = Phi' M Phi + Q1 is the cost to go before, M that after the control of a step
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, overload
 
 from covocp.base.arguments import a, check_argument
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import matrix, square

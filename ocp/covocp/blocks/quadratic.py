@@ -6,7 +6,6 @@ numbered as in docs/blocks/peak_seeking.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.short_repr import short_repr

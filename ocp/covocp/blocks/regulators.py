@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.short_repr import short_repr

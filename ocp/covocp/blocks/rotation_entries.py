@@ -8,7 +8,6 @@ as SX, an MX through a function of SX (`arithmetic.apply`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -16,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr, Given
 from covocp.blocks.arithmetic import apply, precision
 from covocp.blocks.values import SYMBOLIC, array, is_symbolic, wrong_argument

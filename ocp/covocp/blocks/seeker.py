@@ -7,7 +7,6 @@ docs/blocks/peak_seeking.md; the equations are numbered as there.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import casadi as ca
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import checked, is_number, one_of, optional, positive, truth, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, standard_deviations

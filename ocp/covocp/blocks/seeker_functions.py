@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, half_length
 from covocp.base.short_repr import short_repr

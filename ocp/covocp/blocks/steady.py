@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import innovation_gain, kalman_gain
 from covocp.base.short_repr import short_repr

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, Literal
 
 import casadi as ca
@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from covocp.base.arguments import checked
 from covocp.base.checks import as_number
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import TABLE, Expr, Given
 from covocp.base.matrices import Array

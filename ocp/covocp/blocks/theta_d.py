@@ -15,7 +15,6 @@ exp(-l_1 t); the gain after (17) lacks a power of θ; (61) has a transposition t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.short_repr import short_repr
 from covocp.blocks import theta_d_series as series

@@ -14,7 +14,6 @@ form). Where A(x) = sum of phi_k(x) A_k, T_n is a polynomial in phi and epsilon 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -22,6 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, half_length, pack, pack_symbolic, unpack, unpack_symbolic
 from covocp.base.short_repr import short_repr

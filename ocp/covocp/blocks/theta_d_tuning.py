@@ -6,7 +6,6 @@ Everything here is about a regulator (A0, A, B, Q, R); for a filter give the dua
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import warn_user
 from covocp.base.expressions import Expr
 from covocp.base.short_repr import short_repr

@@ -10,11 +10,12 @@ import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, ProblemError, kind_and_name, remedy_for_symbols, spelling
 from covocp.problem.builder import Problem
 from covocp.problem.phases import Phases

@@ -6,13 +6,14 @@ import datetime
 import importlib.metadata
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import casadi as ca
 
 from covocp.base.arguments import checked, mapping, optional, positive, texts_by_name, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError, no_export_option, warn_user
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr

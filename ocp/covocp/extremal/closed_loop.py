@@ -14,13 +14,13 @@ it by (E-1), extended by Z (6.11), and from E and S of the design by (E-20).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, pack_symbolic, stacked, unpack, unpack_symbolic

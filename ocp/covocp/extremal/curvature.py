@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.buffered import Buffered
+from covocp.base.dataclass import dataclass
 from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

@@ -9,7 +9,6 @@ The values at the nodes stay those of the transcription; what they miss is sprea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_indices, read_only
 from covocp.base.quadrature import hermite

@@ -8,19 +8,21 @@ each other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.checks import check_density
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
-from covocp.statement.chain import Link
 from covocp.statement.statement import Statement
+
+if TYPE_CHECKING:
+    from covocp.statement.chain import Link
 
 # Relative size of a negative eigenvalue that counts as roundoff, and of the smallest one of a measurement's noise.
 ROUNDOFF = 1e-12

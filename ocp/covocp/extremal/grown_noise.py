@@ -15,13 +15,13 @@ trapezoidal rule, whose error falls with the square of their number; that D is i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr

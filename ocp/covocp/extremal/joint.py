@@ -7,7 +7,6 @@ which is stepped with it, by parts that begin with its own time scale and grow w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import swept
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER

@@ -7,13 +7,13 @@ H is the same on both sides. Comparisons of the time, of parameters and of state
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.pieces import Borders, borders_of, calls, expanded, may_jump
 from covocp.base.short_repr import short_repr

@@ -14,13 +14,14 @@ unstable.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import lru_cache
 from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, stacked, unpack_symbolic

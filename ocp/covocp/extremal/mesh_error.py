@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from math import gcd
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.final_deviations import final_deviations
 from covocp.extremal.inside import instant_change
-from covocp.extremal.links import Within
 from covocp.extremal.open_loop import Departure, departure, matrices_along_controls, nominal_along
 from covocp.extremal.unseen import changes_within_steps
 from covocp.statement.statement import Statement
@@ -23,6 +24,9 @@ from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
 from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Multipliers, Trajectory
+
+if TYPE_CHECKING:
+    from covocp.extremal.links import Within
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
 COARSE_MESH = 2e-4

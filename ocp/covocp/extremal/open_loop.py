@@ -6,11 +6,12 @@ are off grows with the plant through all that follow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal

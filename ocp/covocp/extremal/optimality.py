@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import warn_user
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary

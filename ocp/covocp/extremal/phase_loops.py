@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop, close_loop, design_statistics

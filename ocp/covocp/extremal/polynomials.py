@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, distinct, unpack
 from covocp.base.quadrature import hermite
 from covocp.base.short_repr import short_repr

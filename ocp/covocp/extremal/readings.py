@@ -7,12 +7,12 @@ At an instant the estimate y and its error e jump with what is new in the readin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.gains import innovation_gain
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.short_repr import short_repr

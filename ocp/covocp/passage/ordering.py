@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 
 # Largest share of the operations on the whole matrix: those by nonzeros are slower, three times on chains of masses.

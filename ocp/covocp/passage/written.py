@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.nodes import Buffers, Node
@@ -111,6 +110,8 @@ class Tape:
 
     def written(self) -> Written:
         """The C code of all of them, in the form that is written."""
+        from importlib.resources import files
+
         folder = files("covocp.passage")
         parts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SOURCES if self._unwritten]
         bodies: dict[str, str] = {}

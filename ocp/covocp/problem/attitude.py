@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import density_matrix, is_symbolic
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.geometry import Chart

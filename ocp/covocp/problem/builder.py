@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,6 @@ from covocp.base.arguments import checked, text, truth
 from covocp.base.checks import as_number, caller, check_kind, check_positive
 from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
-from covocp.problem.attitude import Attitude, with_attitude
 from covocp.problem.checks import column_expression
 from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.data import data_over_time
@@ -32,6 +31,9 @@ from covocp.problem.symbols import (
     vector_state,
 )
 from covocp.problem.wanted import Wanted
+
+if TYPE_CHECKING:
+    from covocp.problem.attitude import Attitude
 
 
 @methods_one_at_a_time
@@ -141,6 +143,8 @@ class Problem(Wanted):
         Raises:
             ProblemError: name used twice, no rotation, shapes that do not fit, variance or density negative.
         """
+        from covocp.problem.attitude import with_attitude
+
         self._declare(name, 1)
         given = {"initial": initial, "final": final, "rate": rate, "guess": guess, "variance": variance, "noise": noise}
         declarations, attitude = with_attitude(self._declarations, name, where=caller(), **given)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.arguments import check_argument, checked_class, truth
 from covocp.base.checks import check_positive, check_times, one_number
+from covocp.base.dataclass import dataclass
 from covocp.base.geometry import Chart
 from covocp.base.matrices import Array
 from covocp.base.pickling import not_pickled

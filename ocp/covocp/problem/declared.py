@@ -7,12 +7,10 @@ from typing import Any, TypeVar
 import casadi as ca
 
 from covocp.base.expressions import Given
-from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.chances import with_chance_conditions
 from covocp.problem.checks import check_name, check_size
 from covocp.problem.declarations import Chance, Declarations
-from covocp.problem.description import sections
 from covocp.problem.expected_cost import statement_of
 from covocp.statement.statement import Statement
 
@@ -77,10 +75,16 @@ class Declared:
 
     def __str__(self) -> str:
         """What print shows: symbols with their data, and the equations in their names."""
+        from covocp.base.pages import as_text
+        from covocp.problem.description import sections
+
         return as_text(sections(self))
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the same tables."""
+        from covocp.base.pages import as_html
+        from covocp.problem.description import sections
+
         return as_html(sections(self))
 
     @property

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import casadi as ca
+
+from covocp.base.dataclass import dataclass
 
 # Operations of an expression that is written out, at most; of a longer one only its size is told.
 MOST_OPERATIONS = 150

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_number, caller, check_inside, column, is_symbolic, symmetric_data
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.matrices import half_length, unpack_symbolic
 from covocp.base.short_repr import short_repr

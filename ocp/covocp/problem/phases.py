@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
 from covocp.base.checks import caller, check_kind, density_matrix, shape_error
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, kind_and_name
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.short_repr import short_repr

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_number, check_density, check_symmetric_numbers, digits
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, pack, standard_deviations, unpack, without_rounding

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.normal import shown_probability
 from covocp.base.pages import Section, Sentence, Table, number
 from covocp.simulation.sampling import share_band

@@ -10,7 +10,6 @@ all: neither is counted.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +17,7 @@ import casadi as ca
 import numpy as np
 from scipy import special
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.base.pickling import pickled_without

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, Cloud, run_stretch
 from covocp.simulation.flown import LawFailedError

@@ -9,12 +9,12 @@ own estimate into the expression, and its covariance goes by the tangent there.
 from __future__ import annotations
 
 from collections.abc import Container
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, half_length, pack_symbolic, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System, unknown_rows

@@ -6,7 +6,6 @@ For laws that are functions of an estimate and of time, as the blocks make them;
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, ProblemError, shown, warn_user
 from covocp.base.expressions import Given
 from covocp.base.gains import weighted

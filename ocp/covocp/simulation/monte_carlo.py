@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.arguments import checked, one_of
 from covocp.base.arguments import truth as a_truth
 from covocp.base.checks import as_number
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.later import later

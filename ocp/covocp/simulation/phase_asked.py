@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import spelling
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, kind_and_name
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array

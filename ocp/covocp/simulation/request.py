@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from covocp.base.arguments import MOST, is_whole, positive
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr

@@ -7,10 +7,11 @@ those of the fine one, so that their difference is the error of the step and not
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, Cloud, run_batch

@@ -8,13 +8,14 @@ are divided until none of them holds more than half a period.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import warn_user
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr

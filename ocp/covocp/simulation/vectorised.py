@@ -10,7 +10,6 @@ solvers) go through `map`, with the same property.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import concurrent.futures
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
 from covocp.base.ctrl_c import LISTENER
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import TURN

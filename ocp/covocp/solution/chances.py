@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.normal import inside, margin, shown_probability
-from covocp.base.pages import Section, Sentence, Table, number
 from covocp.base.residuals import PASSED
 from covocp.statement.chances import ChanceLimits
 from covocp.transcription.limit_units import limit_units
 
 if TYPE_CHECKING:
+    from covocp.base.pages import Section
     from covocp.solution.solution import Solution
 
 # Share of the risk by which a probability may be missed before it is called so: the tolerance of the solver.
@@ -137,6 +137,8 @@ def _root(square: Array) -> Array:
 
 def chance_section(entries: tuple[Reached, ...]) -> Section:
     """A table of what is reached, and what it means."""
+    from covocp.base.pages import Sentence, Table, number
+
     if not entries:
         return []
     columns = ["chance", "asked", "reached", "margin", "deviation", "at t [s]", ""]

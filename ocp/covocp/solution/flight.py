@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, pack, standard_deviations
 from covocp.extremal.closed_loop import covariances_along, loop_substeps
 from covocp.solution.solution import Solution

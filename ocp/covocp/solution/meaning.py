@@ -7,12 +7,12 @@ statement knows of its own structure), and what is no part of a problem (guesses
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.pieces import expanded, operands_of
 from covocp.base.short_repr import short_repr

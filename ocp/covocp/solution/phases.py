@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.arguments import checked, one_of
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import MissingAttributeError, ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
@@ -24,6 +24,8 @@ from covocp.statement.chain import Link
 from covocp.statement.names import name_of, sizes_of, unknown_name
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import matplotlib.figure
 
 # Residual where phases meet from which on the printout worries about it.

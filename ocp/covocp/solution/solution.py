@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import casadi as ca
@@ -12,33 +11,27 @@ import numpy as np
 
 from covocp.base.arguments import checked, one_of, truth
 from covocp.base.checks import is_whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, read_only, smallest_eigenvalue
-from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
-from covocp.extremal.links import Within
-from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
-from covocp.extremal.optimality import Optimality, assess, identities, mention_saddle
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
-from covocp.extremal.phase_loops import PhaseLoop
 from covocp.extremal.polynomials import Dense
 from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.solution.chances import Reached, reached
 from covocp.solution.costs import identity_of_costs, split_cost
 from covocp.solution.covariances import all_covariances, are_semidefinite, covariance_between
 from covocp.solution.duals import costate_of, multiplier_of
-from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
-from covocp.solution.patience import longest
 from covocp.solution.reading import by_name, expression_values, name_in, other_loop
 from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
@@ -50,7 +43,15 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import matplotlib.figure
+
+    from covocp.extremal.links import Within
+    from covocp.extremal.mean_effect import MeanEffect
+    from covocp.extremal.optimality import Optimality
+    from covocp.extremal.phase_loops import PhaseLoop
+    from covocp.solution.fingerprint import Fingerprint
 
 
 @methods_one_at_a_time
@@ -230,15 +231,9 @@ class Solution:
     @cached
     def optimality(self) -> Optimality:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
-        if self.stored_optimality is not None:
-            return self.stored_optimality
-        known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
-        if not self.optimised:
-            return identities(self.extremal, *known)
-        found = assess(self.extremal, self.costates, *known, self.within, longest(self.stats))
-        if self.converged:
-            mention_saddle(found.curvature)
-        return found
+        from covocp.solution.assessed import optimality_of
+
+        return optimality_of(self)
 
     @property
     def cost_identity(self) -> float | None:
@@ -251,9 +246,9 @@ class Solution:
     @cached
     def mean_effect(self) -> MeanEffect | None:
         """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
-        if self.loop is None or self.statement is None or self.within is not None:
-            return remembered(self.stats)
-        return mean_effect(self.extremal, self.loop)
+        from covocp.solution.assessed import mean_effect_of
+
+        return mean_effect_of(self)
 
     @cached
     def smallest_eigenvalue(self) -> float:
@@ -491,6 +486,8 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the same summary, and the figure."""
+        from covocp.base.pages import as_html
+
         return as_html(later("solution.report").sections(self), later("plot.embedding").embedded(self.plot))
 
     @property

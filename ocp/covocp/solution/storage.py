@@ -26,6 +26,7 @@ from covocp.base.archive import DamagedFileError, packed, unpacked
 from covocp.base.errors import CovocpError, ExportError, ProblemError
 from covocp.base.files import check_target, written_whole
 from covocp.base.threads import one_at_a_time
+from covocp.extremal.links import Within
 from covocp.extremal.mean_effect import MEAN_EFFECT, noted
 from covocp.extremal.optimality import Optimality
 from covocp.solution.fingerprint import Fingerprint, fingerprint
@@ -43,6 +44,8 @@ REASON = 160  # letters of a reason that an error quotes
 # Fields: of the problem, which is not kept; of the candidate, whose own fields are entries of the file.
 NOT_KEPT, OPENED = "stated", "extremal"
 OPTIONAL = ("within",)  # not there where they are None
+# Types of fields of a solution that its module does not load.
+LATER = {kind.__name__: kind for kind in (Optimality, Fingerprint, Within)}
 NEEDED = ("stored_costates", "stored_dense")  # may be None in a solution that knows its problem, not in a file
 # Of the numbers that methods report, those that the printed summary takes for granted.
 STATS: dict[str, Any] = {
@@ -299,7 +302,7 @@ def _parts(kind: Any) -> dict[str, Any]:
     """Types of the fields of a class by name, those that are kept; none of what is no dataclass."""
     if not is_dataclass(kind):
         return {}
-    hints = typing.get_type_hints(kind, include_extras=True)
+    hints = typing.get_type_hints(kind, localns=LATER, include_extras=True)
     return {f.name: hints[f.name] for f in fields(kind) if f.name != NOT_KEPT}
 
 

@@ -8,10 +8,11 @@ shorter steps the nominal is solved for again by these.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Outcome
 from covocp.extremal.given_controls import (

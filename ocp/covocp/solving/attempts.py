@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import chain
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import Interrupted, OutsideDomainError, ProblemError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
-from covocp.extremal.links import ChainOutcome
-from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.transcription.trajectory import Trajectory, between
 
-AnyOutcome = Outcome | ChainOutcome
+if TYPE_CHECKING:
+    from covocp.extremal.links import ChainOutcome
+    from covocp.solution.phases import PhasesSolution
+
+AnyOutcome: TypeAlias = "Outcome | ChainOutcome"
 Found = TypeVar("Found", Outcome, Solution)
 Start = TypeVar("Start")
 # Starts that are tried where a method loses its way.
@@ -306,7 +309,7 @@ def _tentative(guess: Guess | tuple[Guess, ...]) -> Any:
 
 def cost_of(outcome: Outcome | ChainOutcome) -> float:
     """All terms together."""
-    return outcome.cost if isinstance(outcome, ChainOutcome) else float(sum(outcome.cost_terms.values()))
+    return float(sum(outcome.cost_terms.values())) if isinstance(outcome, Outcome) else outcome.cost
 
 
 def rank(outcome: Outcome) -> tuple[float, float]:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import replace
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from covocp.base.arguments import checked, optional, positive, whole
 from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
-from covocp.extremal.links import ChainOutcome
-from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from covocp.extremal.links import ChainOutcome
+    from covocp.statement.chain import Chain
 
 IPOPT, REDUCED = "covocp.solvers.ipopt", "covocp.solvers.reduced"
 # Control values from which on the dense Hessian of the reduced method takes longer than its sweeps.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, Interrupted, warn_user, without_warnings
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

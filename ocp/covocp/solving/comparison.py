@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.arguments import checked, is_number
 from covocp.base.checks import check_kind, check_positive
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
@@ -17,13 +18,13 @@ from covocp.problem.builder import Problem
 from covocp.problem.checks import find_name
 from covocp.problem.data import check_data_cover
 from covocp.problem.declarations import Declarations
-from covocp.problem.restart import Start, declared_values, restartable, values_of
 from covocp.solution.solution import Solution
 from covocp.solving.warm_start import Later
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 
 if TYPE_CHECKING:
+    from covocp.problem.restart import Start
     from covocp.solving.solver import Solver
 
 # Solvers of other durations that are kept.
@@ -47,6 +48,8 @@ def movable(problem: Problem) -> Problem:
     Raises:
         ProblemError: no problem, or its statement is wrong.
     """
+    from covocp.problem.restart import restartable
+
     check_kind(problem, Problem, "movable(problem): give the problem itself, of several phases each one")
     return Problem.of(restartable(problem.declarations, problem.statement()).declarations)
 
@@ -76,6 +79,8 @@ class Elsewhere:
         Raises:
             ProblemError: the duration is no argument.
         """
+        from covocp.problem.restart import restartable
+
         if duration is not None:
             duration = self._checked(duration)
         if duration not in self._kept:
@@ -135,6 +140,8 @@ class Elsewhere:
         Raises:
             ProblemError: one of them is wrong.
         """
+        from covocp.problem.restart import declared_values, values_of
+
         own = self.declarations
         for argument, given in (("parameters", parameters), ("means", means)):
             if given is not None and not isinstance(given, Mapping):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -13,12 +13,12 @@ from covocp.base.progress import Progress
 from covocp.extremal.densities import impossible_density, impossible_in_phases
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import missed
-from covocp.extremal.links import ChainOutcome
 from covocp.extremal.open_loop import matrices_along_controls
-from covocp.solution.report import stated_first
 from covocp.solution.solution import Solution
-from covocp.solving.decisions import bent_cost, bent_data, far_away
 from covocp.transcription.halved_steps import refined_run
+
+if TYPE_CHECKING:
+    from covocp.extremal.links import ChainOutcome
 
 # A violation that has not fallen for so many iterations, which are this share of the run, is not on its way to zero.
 MANY, MOST = 100, 0.5
@@ -28,7 +28,7 @@ NAMED = 10
 GAP = "continuity of "
 CONTRADICT = "the constraints may contradict"
 
-AnyOutcome = TypeVar("AnyOutcome", Outcome, ChainOutcome)
+AnyOutcome = TypeVar("AnyOutcome", Outcome, "ChainOutcome")
 
 
 def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_way: str) -> SolveError:
@@ -41,6 +41,9 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         solution: the last iterate.
         other_way: a line about another method; empty: none.
     """
+    from covocp.solution.report import stated_first
+    from covocp.solving.decisions import bent_cost, bent_data, far_away
+
     along = _passed_along(outcome) | _passed_by_integrals(outcome)
     violations = along | {row: max(value, along.get(row, 0.0)) for row, value in outcome.violations.items()}
     lines = [f"  {row}: {value:.6g}" for row, value in stated_first(violations)[:NAMED]]

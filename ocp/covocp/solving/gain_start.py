@@ -10,12 +10,13 @@ and the nominal, is the solver's.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, SolveError, without_warnings
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct, pack, unpack
@@ -30,10 +31,8 @@ from covocp.problem.closed_loop_covariance import SMALLEST_VARIANCE, reasons, us
 from covocp.problem.declarations import Declarations, Parameter, Place
 from covocp.problem.expected_cost import ESTIMATE, GAIN, statement_of
 from covocp.solution.origin import METHOD
-from covocp.solution.report import ASKED
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import with_stats
-from covocp.solving.below_error import chances_below
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
@@ -106,6 +105,8 @@ def with_gain_told(problem: Problem, outcome: Outcome, best: Solution | None) ->
     asked = reasons(problem.declarations)
     if not asked:
         return outcome
+    from covocp.solution.report import ASKED
+
     outcome = with_stats(outcome, **{ASKED: ", ".join(asked)})
     if outcome.converged:
         return outcome
@@ -127,6 +128,8 @@ def beyond(own: Declarations, best: Solution | None, *, surely: bool = False) ->
     """
     if best is None or best.loop is None or own.spread is None:
         return ""
+    from covocp.solving.below_error import chances_below
+
     least = spread_halves(best.loop, fed=False)
     told = []
     for row in rows_of(own):

@@ -10,13 +10,13 @@ from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.threads import one_at_a_time
 from covocp.problem.builder import Problem
-from covocp.problem.phases import Phases
 from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, check_method
 from covocp.solving.random_starts import multistart
 from covocp.solving.solver import Solver
 
 if TYPE_CHECKING:
+    from covocp.problem.phases import Phases
     from covocp.solution.phases import PhasesSolution
 
 
@@ -66,11 +66,14 @@ def solve(
             (carries the best solution without it).
         Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
     """
-    if isinstance(problem, Phases):
-        check_method(method)
-        run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
-        run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
-        return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
+    if not isinstance(problem, Problem):
+        from covocp.problem.phases import Phases
+
+        if isinstance(problem, Phases):
+            check_method(method)
+            run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
+            run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
+            return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
     random = multistart(guess, options)
     extra: dict[str, Any] = {} if random is None else dict(zip(("starts", "seed"), random, strict=True))
     solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)

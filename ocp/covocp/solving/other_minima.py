@@ -12,11 +12,7 @@ from covocp.base.errors import CovocpError, last_line, warn_user
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.extremal.cost_sizes import variable_cost
 from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
-from covocp.extremal.links import ChainOutcome
-from covocp.extremal.optimality import mention_saddle
-from covocp.extremal.worth import HARDLY, worth_telling
 from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
@@ -27,6 +23,7 @@ from covocp.transcription.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from covocp.extremal.curvature import Curvature
+    from covocp.extremal.links import ChainOutcome
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
@@ -46,7 +43,7 @@ OF_STARTS = ("starts", "asked")
 # What is looked for.
 SADDLE, TURNS = "the run ended at a saddle", "angles turn full circle between its nodes"
 
-Looked = TypeVar("Looked", Outcome, ChainOutcome)
+Looked = TypeVar("Looked", Outcome, "ChainOutcome")
 
 
 def away_from_saddle(
@@ -96,6 +93,9 @@ def _off_saddle(
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
     if curvature is None or curvature.verdict != "saddle":
         return outcome
+    from covocp.extremal.optimality import mention_saddle
+    from covocp.extremal.worth import HARDLY, worth_telling
+
     candidates = []
     for sign in ESCAPES:
         moved = _displaced(outcome.extremal, curvature, sign)
@@ -138,6 +138,9 @@ def _suspicious(outcome: Outcome, start: Guess) -> bool:
 
 def _mention_left(outcome: Outcome, seconds: float) -> None:
     """Warn where a run from beside a saddle went no further: initial states may be in far too small a unit for it."""
+    from covocp.extremal.optimality import mention_saddle
+    from covocp.extremal.worth import worth_telling
+
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
     if curvature is not None and curvature.verdict == "saddle" and worth_telling(outcome.extremal, curvature):
         mention_saddle(curvature.value / curvature.largest)
@@ -176,6 +179,8 @@ def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Traject
     Bounds may tell too large a magnitude of an initial state, and none at all where they are left out: it is moved so
     far that by its curvature a share of the cost is gained, between what the bounds count for at least and at most.
     """
+    from covocp.extremal.cost_sizes import variable_cost
+
     t, st = extremal.trajectory, extremal.statement
     units = moving_units(st, extremal.mesh, t, extremal.parameters)
     controls = np.maximum(np.sqrt(np.mean(t.u**2, axis=0)), DISPLACEMENT * units)

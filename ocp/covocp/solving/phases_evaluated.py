@@ -8,11 +8,12 @@ truth the gains are those of the design, and what a link adds is what the truth 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import OutsideDomainError, ProblemError, SolveError, evaluating, kind_and_name
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice, product
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, OutsideDomainError
 from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -192,6 +191,8 @@ def _wave(statement: Statement, mesh: Mesh, flat: Array, generator: np.random.Ge
 
 def _drawn_state(statement: Statement, index: int, guess: float, share: float) -> float:
     """A free initial value: between its bounds where it has two, else around its guess."""
+    from statistics import NormalDist
+
     lower, upper = (float(bound[index]) for bound in statement.state_bounds)
     if np.isfinite(lower) and np.isfinite(upper):
         return _between(lower, upper, share)

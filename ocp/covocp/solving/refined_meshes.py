@@ -8,11 +8,12 @@ their intervals have errors of the same size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError, warn_user
 from covocp.base.matrices import Array, distinct
 from covocp.base.progress import Progress

@@ -6,11 +6,12 @@ What is made of the first mesh is in `refined_meshes`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct
@@ -20,7 +21,6 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.path_limits import limited_along
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import cost_of, from_starts
-from covocp.solving.refined_meshes import Measured
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
@@ -29,6 +29,9 @@ from covocp.transcription.mesh import Graded, Mesh, Options
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import stiffness
+
+if TYPE_CHECKING:
+    from covocp.solving.refined_meshes import Measured
 
 # Intervals of the first mesh where none are given.
 FIRST = 16
@@ -69,6 +72,8 @@ class ProblemRuns:
 
     def measured(self, options: Options, prepared: Prepared, outcome: Outcome, least: float) -> Measured:
         """A mesh with what came of it, not measured."""
+        from covocp.solving.refined_meshes import Measured
+
         return Measured(
             options=(options,),
             meshes=(prepared.mesh,),

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from covocp.extremal.mesh_error import OPTIMISED, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
-from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, counted, from_starts, interrupted, mention_left, with_stats
@@ -40,17 +39,13 @@ from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.from_classical import SOON, impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
-from covocp.solving.gain_ways import by_any_way
 from covocp.solving.held_duration import off_the_limit
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
-from covocp.solving.other_ways import Way, other_covariances, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
-from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
-from covocp.solving.suited_mesh import Beginning, beginning, other_nodes, suits
 from covocp.solving.unused import mention_clock, mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guesses
 from covocp.statement.magnitudes import check_magnitudes
@@ -60,6 +55,10 @@ from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_substeps
 from covocp.transcription.starts import own_start
+
+if TYPE_CHECKING:
+    from covocp.solving.other_ways import Way
+    from covocp.solving.suited_mesh import Beginning
 
 OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
 # Times of the runs of a solution [s], and of what else was waited for: runs that lead to its start, what is looked at.
@@ -96,6 +95,7 @@ class Solver(ClassicalRuns):
         **options: Any,
     ) -> None:
         """Build the statement and make the method ready."""
+
         begin = time.perf_counter()
         check_method(method)
         check_problem(problem)
@@ -365,6 +365,8 @@ class Solver(ClassicalRuns):
         """
         if np.array_equal(values, self._values):
             return
+        from covocp.solving.suited_mesh import beginning, other_nodes, suits
+
         mesh, begin = self._prepared.mesh, beginning(*self._ungraded, values)
         borne = beginning(*self._ungraded, self._values) if self._borne is None else self._borne
         on_nodes = mesh.step == "rk4" and bool(self.statement.matrices)  # the steps depend on them
@@ -408,6 +410,8 @@ class Solver(ClassicalRuns):
 
         The way that finds a solution is that of later runs.
         """
+        from covocp.solving.gain_ways import by_any_way
+
         given = (self._solved, self._options, self._ready, self._other_ways, failed, (best, near), reporter)
         outcome, kept = by_any_way(*given, further=not beyond(self._problem.declarations, best))
         if kept is not None:
@@ -416,6 +420,8 @@ class Solver(ClassicalRuns):
 
     def _other_ways(self) -> Iterator[Way]:
         """Those that are open."""
+        from covocp.solving.other_ways import other_ways
+
         taken = method_options(self._by)
         return other_ways(self._solved, self._options, self._prepared.mesh, self._own, taken)
 
@@ -450,6 +456,8 @@ class Solver(ClassicalRuns):
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
         if not self._remade or reporter.stop:
             return outcome
+        from covocp.solving.refined_meshes import remade
+
         runs = refining.ProblemRuns(self._solved, values, self._by, self._ready, reporter)
         found = remade(runs.measured(self._options, self._prepared, outcome, refining.unseen(self._own)), runs)
         assert isinstance(found.outcome, Outcome)
@@ -471,6 +479,9 @@ class Solver(ClassicalRuns):
 
     def _other_way(self, failed: Outcome, best: Solution | None) -> str:
         """A line for a run that failed, where another method or other options are known to be more robust."""
+        from covocp.solution.report import OTHERWISE
+        from covocp.solving.other_ways import other_covariances, told_ways
+
         if not self._by_ipopt or beyond(self._problem.declarations, best):
             return ""
         if self.method == "ipopt" and is_suited(self._solved, self._prepared.mesh):

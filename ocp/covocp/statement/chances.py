@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import casadi as ca
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.pickling import pickled_without
 from covocp.base.short_repr import short_repr

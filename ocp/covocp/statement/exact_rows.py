@@ -9,13 +9,14 @@ Q_uu and W_uu.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
 from covocp.statement.conditions import Inside

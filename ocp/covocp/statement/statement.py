@@ -12,13 +12,14 @@ and leaves out those that it cannot depend on. `parameters` stacks the known par
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_length

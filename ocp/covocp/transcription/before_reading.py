@@ -7,11 +7,11 @@ it off. Its dynamics keep Xhat semidefinite by themselves: the limit is left out
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 

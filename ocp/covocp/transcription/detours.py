@@ -8,11 +8,12 @@ to so many tries. What is found first is then about the cheapest.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.transcription.clearing import Clearing, Push, cleared, energy, in_sizes

@@ -12,10 +12,11 @@ E falls like 1/t).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.quadrature import covariance_after, interpolated

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import sequence_of
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr

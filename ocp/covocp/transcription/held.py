@@ -12,7 +12,7 @@ prefers the states to be; the next ones are the runs under the feedback.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered, Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import Interval, model_symbols, repeated

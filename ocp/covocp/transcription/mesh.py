@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.arguments import MOST, is_number
 from covocp.base.checks import as_number, is_whole
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import LINEAR_SOLVER

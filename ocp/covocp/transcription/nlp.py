@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -10,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import OutsideDomainError
 from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array

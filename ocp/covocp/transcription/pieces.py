@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.statement.chain import Link
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.separable import COST, Piece, Whole
 from covocp.transcription.shooting import advancing
+
+if TYPE_CHECKING:
+    from covocp.statement.chain import Link
 
 
 def is_separable(statement: Statement, mesh: Mesh) -> bool:

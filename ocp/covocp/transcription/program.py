@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.chain import Chain, Link

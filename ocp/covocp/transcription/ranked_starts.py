@@ -15,7 +15,6 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
-from covocp.transcription.detours import detours
 from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.mirrored import other_sides
@@ -122,6 +121,8 @@ def _ways_round(
         if met:
             yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
         return
+    from covocp.transcription.detours import detours
+
     roots = tried[:-1] if any(through[:-1]) else tried
     coarse = coarse_mesh(statement, mesh, tuple(parameters), DETOURS)
     least = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)

@@ -7,7 +7,6 @@ the ends of the segments (`segment_slopes`), back for the slopes of a cost (`cos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -16,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr, plus, times
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import classical_step

@@ -6,7 +6,7 @@ and Newton bring them to their final values. What else there is to start from is
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import is_number
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated

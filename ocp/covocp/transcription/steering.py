@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import sequence_of
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,6 @@ import numpy as np
 from covocp.base.expressions import Expr, above, densified, minus, over, plus, slopes_by, times
 from covocp.base.matrices import Array
 from covocp.passage.sweep import depends, passed_by
-from covocp.passage.written import Tape
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
@@ -25,7 +24,9 @@ from covocp.transcription.pieces import is_separable, pieces
 from covocp.transcription.sequences import Passage
 from covocp.transcription.shooting import backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
 from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
-from covocp.transcription.taped import Taped
+
+if TYPE_CHECKING:
+    from covocp.passage.written import Tape
 
 # Adjoint sweeps that a Jacobian takes at once.
 LARGEST_DIRECTIONS = 64
@@ -86,6 +87,8 @@ def written_out(statement: Statement, mesh: Mesh, scales: Scales, tape: Tape) ->
         scales: magnitudes in which the NLP works.
         tape: takes the passages.
     """
+    from covocp.transcription.taped import Taped
+
     variables = _Variables(statement, mesh, scales)
     taped = Taped(statement, mesh, variables, tape)
     running, terminal = _costs(variables, taped.nodes)

@@ -8,9 +8,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.export.compiled.linking import Linking
 

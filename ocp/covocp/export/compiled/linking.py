@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import casadi as ca
+
+from covocp.base.dataclass import dataclass
 
 CMAKE = """\
 set(PLUGIN_INCLUDE "" CACHE PATH "folder that holds {include}")

@@ -6,13 +6,14 @@ import re
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from covocp.base.arguments import MOST, checked, is_whole, positive, text, texts
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Given
 from covocp.base.pages import lines_as_html

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic

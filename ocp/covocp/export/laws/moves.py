@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import GAUSS_NODES, gauss_transition, lyapunov_after
 from covocp.base.short_repr import short_repr

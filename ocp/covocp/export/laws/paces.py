@@ -8,12 +8,12 @@ length for every mode, and their number grows as the logarithm of the ratio. A m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import GAUSS_NODES

@@ -27,12 +27,12 @@ of the last of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, stacked, unpack_symbolic

@@ -7,12 +7,13 @@ the solver's own opinion: it follows from the first-order conditions of a minimu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError, no_export_option
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER

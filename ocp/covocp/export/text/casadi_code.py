@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.export.laws.law import Law
 from covocp.export.text.reentrant import reentrant, shares_memory

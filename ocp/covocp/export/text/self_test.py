@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
