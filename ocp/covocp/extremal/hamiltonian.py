@@ -18,6 +18,8 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.slope_terms import absolute_terms
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 
@@ -61,13 +63,25 @@ def hamiltonian(
 
 @lru_cache(maxsize=KEPT)
 def by_controls(statement: Statement) -> ca.Function:
-    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu; no function is made twice of one statement."""
+    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu, absolute terms of H_u (`slope_terms`).
 
-    def select(h: Expr, x: Expr, u: Expr, e: Expr, t: Expr) -> list[Any]:
-        slope = ca.gradient(h, u)
-        return [h, slope, ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)]
+    No function is made twice of one statement.
+    """
+    symbols, rates, weights = _terms(statement)
+    h, u = ca.dot(weights, rates), symbols[1]
+    by_u = ca.jacobian(rates, u)  # of the few rates with a control in them: H itself goes through all
+    slope = by_u.T @ weights if statement.symbolic is ca.SX else ca.gradient(h, u)
+    bend = ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)
+    outputs = [h, slope, bend, absolute_terms(by_u, weights)]
+    return ca.Function("by_controls", symbols, [ca.densify(v) for v in outputs])
 
-    return hamiltonian(statement)("by_controls", select)
+
+def _terms(statement: Statement) -> tuple[list[Expr], Expr, Expr]:
+    """Symbols of the arguments of H, and the rates and running cost whose products with weights are its terms."""
+    symbolic: Any = statement.symbolic
+    symbols = model_symbols(statement)
+    costates = [symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)]
+    return [*symbols, *costates], ca.vertcat(*statement.rates(*symbols)), ca.vertcat(*costates, 1)
 
 
 def duration_slope(statement: Statement) -> ca.Function:
