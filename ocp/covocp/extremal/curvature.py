@@ -23,7 +23,7 @@ from covocp.base.buffered import Buffered, Matrices
 from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.active_constraints import held_by
+from covocp.extremal.active_constraints import held_by, null_space
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -40,8 +40,6 @@ LANCZOS_TOLERANCE = 1e-3
 GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
 # Controls count in units of their own where these differ by more than this factor.
 FAR_APART = 1e3
-# Rows held, of unit length, whose part across the others is below this say nothing new.
-DEPENDENT = 1e-9
 # An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
 # share of the largest eigenvalue, to which solvers meet the conditions that the multipliers come from.
 SAFETY = 10.0
@@ -112,9 +110,7 @@ def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
     strict = reduced.null_space(reduced.strict)
     if not strict.shape[1]:
         return None
-    operator = reduced.operator(strict)
-    if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
-        return None
+    operator = _finite(reduced.operator(strict))
     left = seconds / reduced.seconds - _for_units(extremal.statement.nu, reduced.tangents.start)
     products = _Products(left=max(left, LEAST_STEPS))
     values, vectors, error, known = _extremes(operator, strict, products)
@@ -132,6 +128,18 @@ def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
     moving = list(reduced.tangents.start)
     start[moving] = z[0, moving, 0]
     return Curvature(value=value, largest=largest, error=error, direction=u[:, :, 0], start=start)
+
+
+def _finite(operator: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """An operator that fails where what it gives is no number."""
+
+    def image(direction: Array) -> Array:
+        found = operator(direction)
+        if not np.isfinite(found).all():
+            raise ArithmeticError("the Hessian is not finite")
+        return found
+
+    return image
 
 
 class _TooLongError(Exception):
@@ -394,16 +402,6 @@ def _shares(fine: Extremal, product: Callable[[Array], Array]) -> Array:
     if not own.size or own.max() <= FAR_APART * own.min():
         return np.ones(count)
     return np.where(roots > 0, roots / own.mean(), 1.0)
-
-
-def null_space(rows: Array, size: int) -> Array:
-    """Orthonormal basis of the vectors of some size that are across all rows, whatever the units of each row."""
-    lengths = np.linalg.norm(rows, axis=1)
-    kept = rows[lengths > 0] / lengths[lengths > 0][:, None]
-    if not kept.shape[0]:
-        return np.eye(size)
-    _, values, vectors = np.linalg.svd(kept)
-    return np.asarray(vectors[int(np.sum(values > DEPENDENT * values[0])) :].T)
 
 
 def _root(metric: ca.DM) -> ca.DM:

@@ -27,7 +27,8 @@ def slope_terms(statement: Statement) -> ca.Function:
 
 def absolute_terms(slopes: Expr, weights: Expr) -> Any:
     """The same of the slopes of rates and running cost by the controls, (nx + ne + 1, nu), and their weights in H."""
-    return ca.densify(ca.fabs(slopes).T @ ca.fabs(weights))
+    sizes: Any = ca.fabs(slopes)
+    return ca.densify(sizes.T @ ca.fabs(weights))
 
 
 def slope_sizes(terms: Array, curvature: Array, controls: Array) -> Array:
