@@ -20,6 +20,8 @@ LARGEST_DISTANCE = 1e-3
 # Without a multiplier a value is at its bound within these shares of how far it goes from there and of its size.
 NEAR = 1e-5
 WIDENED = 1e-7
+# Rows held, of unit length, whose part across the others is below this say nothing new.
+DEPENDENT = 1e-9
 
 Entries = tuple[tuple[str, tuple[int, ...]], ...]
 
@@ -146,3 +148,13 @@ def _sides(values: Array, lower: Array, upper: Array, multipliers: Array) -> tup
         result = np.where(holds | (touches & (result == 0)), sign, result)
         strict |= holds
     return result, strict
+
+
+def null_space(rows: Array, size: int) -> Array:
+    """Orthonormal basis of the vectors of some size that are across all rows, whatever the units of each row."""
+    lengths = np.linalg.norm(rows, axis=1)
+    kept = rows[lengths > 0] / lengths[lengths > 0][:, None]
+    if not kept.shape[0]:
+        return np.eye(size)
+    _, values, vectors = np.linalg.svd(kept)
+    return np.asarray(vectors[int(np.sum(values > DEPENDENT * values[0])) :].T)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.stiffness import state_jacobian
+
+# How often a matrix is squared to bound its spectral radius.
+SQUARED = 3
 
 
 def explicit_pairs(extremal: Extremal) -> tuple[int, int]:
@@ -24,12 +28,16 @@ def explicit_pairs(extremal: Extremal) -> tuple[int, int]:
     own = 1 if mesh.step == "rodas" else max(1, mesh.substeps)
     needed = np.full(mesh.intervals, float(own))
     for matrices, times in _linear(extremal):
-        for largest in (_norms, _radii):  # what bounds the rates is had sooner than they are
+        unknown, rates = not np.isfinite(matrices).all(), np.zeros(mesh.intervals + 1)
+        asked = np.ones(mesh.intervals + 1, dtype=bool)
+        for largest in (_norms, _norms_of_powers, _radii):  # what bounds the rates is had sooner than they are
             with np.errstate(over="ignore", invalid="ignore"):
-                rates = times * largest(matrices)
+                rates[asked] = times * largest(matrices[asked])
                 steps = np.maximum(rates[1:], rates[:-1]) * lengths / STIFFNESS_PER_STEP
-            if (steps <= own).all():
+            open_ones = ~(steps <= own)
+            if not open_ones.any():
                 break
+            asked = np.append(open_ones, False) | np.append(False, open_ones) | unknown
         needed = np.maximum(needed, np.where(np.isfinite(steps), steps, np.inf))
     many = np.flatnonzero(needed > max(LARGEST_SUBSTEPS, own))
     first = 0 if not many.size else int(many[-1]) + 1
@@ -46,7 +54,8 @@ def _linear(extremal: Extremal) -> list[tuple[Array, float]]:
     for i, (block, form) in enumerate(zip(st.matrices, st.riccati, strict=True)):
         if form is None:
             continue
-        drift, _, information = (stacked(part, count) for part in form.map(count)(x, u, *others))
+        parts = Matrices(form.map(count)).evaluated(x, u, *others)
+        drift, _, information = (stacked(part, count) for part in parts)
         values = unpack(extremal.trajectory.e[:, list(st.entries((i,)))], block.size)
         result.append((drift - values @ information, 2.0))
     return result
@@ -56,6 +65,15 @@ def _norms(matrices: Array) -> Array:
     """Bounds of the spectral radii: the smaller one of the largest sums of rows and of columns."""
     sizes = np.abs(matrices)
     return np.asarray(np.minimum(sizes.sum(axis=1).max(axis=1), sizes.sum(axis=2).max(axis=1)))
+
+
+def _norms_of_powers(matrices: Array) -> Array:
+    """Closer bounds: roots of the same of a power of the matrices."""
+    scale = np.maximum(np.abs(matrices).max(axis=(1, 2), initial=0.0), np.finfo(float).tiny)
+    powers = matrices / scale[:, None, None]
+    for _ in range(SQUARED):
+        powers = powers @ powers
+    return np.asarray(scale * _norms(powers) ** (0.5**SQUARED))
 
 
 def _radii(matrices: Array) -> Array:

@@ -61,11 +61,12 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: f
         extremal, kinds = refined(extremal), (np.repeat(kinds[0], points, axis=0), np.repeat(kinds[1], points, axis=0))
         around = np.repeat(around, points, axis=1)
     along = _Along.of(extremal, 2)
-    convex = _convex(along.at(j)[2] for j in range(3))
+    places = [along.at(j) for j in range(3)]
+    convex = _convex(place[2] for place in places)
     if extremal.mesh.step == "rodas":
-        total = _by_middles(extremal, along, convex, kinds)
+        total = _by_middles(extremal, along, convex, kinds, places[1][2])
     else:
-        total = _by_points(extremal, along, convex, kinds)
+        total = _by_points(extremal, along, convex, kinds, places)
         left = (kinds[0] | kinds[1]) & ~convex
         if left.any():
             total += _above(extremal, left, around)
@@ -80,7 +81,7 @@ class _Along:
         fine: the extremal with these places as nodes.
         parts: of each interval.
         ends: controls at both ends of each interval (2, N, nu).
-        function: (x, u, e, t, T, p, costates) of all intervals -> H, H_u, H_uu.
+        function: (x, u, e, t, T, p, costates) of all intervals -> H, H_u, H_uu, terms of H_u.
     """
 
     fine: Extremal
@@ -106,7 +107,7 @@ class _Along:
         return self.ends[0] + j / self.parts * (self.ends[1] - self.ends[0])
 
     def at(self, j: int, control: Array | None = None) -> list[Array]:
-        """H (N, 1, 1), H_u (N, nu, 1) and H_uu (N, nu, nu) at place j, with another control where one is given."""
+        """H (N, 1, 1), H_u and its terms (N, nu, 1), H_uu (N, nu, nu) at place j, with another control where given."""
         fine, n = self.fine, self.ends[0].shape[0]
         costates, t = discrete_costates(fine)[0], fine.trajectory
         at = slice(j, j + self.parts * (n - 1) + 1, self.parts)
@@ -154,10 +155,12 @@ def _around(extremal: Extremal) -> Array:
     return np.concatenate([found[[0, 3]] if constant else found, other[None]])
 
 
-def _by_points(extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask]) -> float:
-    """By the Hamiltonian at the ends and in the middles of the intervals, of the controls in which it is convex."""
+def _by_points(
+    extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask], found: list[list[Array]]
+) -> float:
+    """By what is found at the ends and in the middles of the intervals, of the controls in which H is convex."""
     bounds, (free, bounded) = extremal.statement.control_bounds, kinds
-    places = [(along.control(j), *along.at(j)[1:]) for j in range(3)]
+    places = [(along.control(j), slope, bend) for j, (_, slope, bend, _) in enumerate(found)]
     falls = [
         np.where(bounded & convex, _fall(u, slope[..., 0], bend, *bounds), 0.0).sum(axis=1) for u, slope, bend in places
     ]
@@ -193,8 +196,10 @@ def _above(extremal: Extremal, left: Mask, around: Array) -> float:
     return total
 
 
-def _by_middles(extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask]) -> float | None:
-    """By what another value in the middle of each interval changes the discrete cost.
+def _by_middles(
+    extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask], middle: Array
+) -> float | None:
+    """By what another value in the middle of each interval, of this H_uu there, changes the discrete cost.
 
     Implicit steps that are longer than a fast state lives add up what it does, and so does their adjoint: its costate
     at a node may be off by a third, H_u with it, while slopes by control values are exact. A control that changes
@@ -206,7 +211,7 @@ def _by_middles(extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Ma
     square, more = HAT if extremal.mesh.control == "linear" else STEP
     weights = square * np.where((h := np.diff(extremal.time)) > 0, h, 1.0)
     slopes = np.where(h[:, None] > 0, discrete_costates(along.fine)[1][1::2], 0.0) / weights[:, None]
-    curvature = _among(convex, along.at(1)[2])
+    curvature = _among(convex, middle)
     inside = np.where(free, slopes, 0.0)
     gained = 0.5 * np.sum(inside * np.linalg.solve(curvature, inside[..., None])[..., 0], axis=1)
     gained += np.where(bounded, _fall(along.control(1), slopes, curvature, *st.control_bounds), 0.0).sum(axis=1)

@@ -117,27 +117,26 @@ def _discrete(extremal: Extremal) -> tuple[Costates, Array, float]:
     if st.behind or along:
         return _costates_of_passages(extremal)
     last = np.concatenate(terminal_costates(extremal))
-    z = ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
+    z = np.hstack([extremal.trajectory.x, extremal.trajectory.e])
     costates, slopes, by_duration = _swept(extremal, last, impulses(extremal), z)
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 
 def _swept(
-    extremal: Extremal, last: Array, jumps: Array, z: Expr, *, nominal: bool = False
+    extremal: Extremal, last: Array, jumps: Array, z: Array, *, nominal: bool = False
 ) -> tuple[Array, Array, float]:
     """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
     adjoint = adjoint_interval(st, mesh.substeps, mesh.step, nominal=nominal)
     keep, known = (values[:size] for values in _restarts(extremal))
-    stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
+    stacked = (keep, known, jumps[:-1].T, z[:n].T, *extremal.interval_arrays)
     if not keep[:, :-1].any():  # each interval has its own multipliers
-        outputs = adjoint.map(n)(np.tile(last[:, None], n), *stacked)
-        values, by_start, by_end, by_duration = (np.asarray(v.full()).T for v in outputs)
+        outputs = Matrices(adjoint.map(n)).evaluated(np.tile(last[:, None], n), *stacked)
+        values, by_start, by_end, by_duration = (v.T for v in outputs)
     else:
-        backward = list(range(n - 1, -1, -1))
-        outputs = swept(adjoint, last, *(ca.DM(column)[:, backward] for column in stacked))
-        values, by_start, by_end, by_duration = (v[::-1] for v in outputs)
+        swept_back = swept(adjoint, last, *(column[:, ::-1] for column in stacked))
+        values, by_start, by_end, by_duration = (v[::-1] for v in swept_back)
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start
     slopes[int(mesh.control == "linear") :][:n] += by_end
@@ -165,7 +164,7 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
     last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
-    costates, slopes, total = _swept(extremal, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T), nominal=True)
+    costates, slopes, total = _swept(extremal, last_x, jumps[:, :nx] + by_x, t.x, nominal=True)
     return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
 
 
@@ -405,14 +404,15 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     jumps = impulses(extremal)
     first = -jumps[0, [st.nx + k for k in behind]]
     jumps[0, [st.nx + k for k in behind]] = 0.0  # these costates are given
-    given, last_given = given_costates(st, values, extremal.intervals, pairs, first)
+    common = extremal.interval_arrays
+    given, last_given = given_costates(st, values, common, pairs, first)
     points = values[backward].transpose(2, 0, 1).reshape(size, -1)
-    stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), jumps[:-1].T)]
+    stacked = [column[:, ::-1] for column in (*_restarts(extremal), jumps[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
     last[: st.nx] += passage_end(extremal, last_given)[0]
     reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
-    (result,) = swept(sweep, last, *stacked, points, reversed_given, *extremal.intervals.columns(backward))
+    (result,) = swept(sweep, last, *stacked, points, reversed_given, *common.columns(backward))
     costates = np.vstack([result[::-1], last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
 

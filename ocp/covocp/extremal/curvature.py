@@ -19,18 +19,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.buffered import Buffered
+from covocp.base.buffered import Buffered, Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.active_constraints import held_by
+from covocp.extremal.active_constraints import held_by, null_space
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.free_starts import free_start, largest, start_weights
 from covocp.extremal.hamiltonian import Costates
-from covocp.extremal.lagrangian import arguments, node_size, second_order, slopes_of_intervals
+from covocp.extremal.lagrangian import arguments, held_rows, node_size, second_order, slopes_of_intervals
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
 
@@ -41,8 +41,6 @@ LANCZOS_TOLERANCE = 1e-3
 GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
 # Controls count in units of their own where these differ by more than this factor.
 FAR_APART = 1e3
-# Rows held, of unit length, whose part across the others is below this say nothing new.
-DEPENDENT = 1e-9
 # An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
 # share of the largest eigenvalue, to which solvers meet the conditions that the multipliers come from.
 SAFETY = 10.0
@@ -113,9 +111,7 @@ def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
     strict = reduced.null_space(reduced.strict)
     if not strict.shape[1]:
         return None
-    operator = reduced.operator(strict)
-    if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
-        return None
+    operator = _finite(reduced.operator(strict))
     left = seconds / reduced.seconds - _for_units(extremal.statement.nu, reduced.tangents.start)
     products = _Products(left=max(left, LEAST_STEPS))
     values, vectors, error, known = _extremes(operator, strict, products)
@@ -133,6 +129,18 @@ def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
     moving = list(reduced.tangents.start)
     start[moving] = z[0, moving, 0]
     return Curvature(value=value, largest=largest, error=error, direction=u[:, :, 0], start=start)
+
+
+def _finite(operator: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """An operator that fails where what it gives is no number."""
+
+    def image(direction: Array) -> Array:
+        found = operator(direction)
+        if not np.isfinite(found).all():
+            raise ArithmeticError("the Hessian is not finite")
+        return found
+
+    return image
 
 
 class _TooLongError(Exception):
@@ -278,18 +286,19 @@ class _Reduced:
         between = _between(extremal, fine)
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
-        once = _seconds(product, given)
+        applied = _applied(product, given)
+        once = _seconds(applied, product.size1_in(product.n_in() - 1))
         if once * (LEAST_STEPS + _for_units(st.nu, tangents.start)) > seconds:
             raise _TooLongError
         moving = np.flatnonzero(tangents.free).tolist()
-        applied, weights = _applied(product, given), np.zeros(0)
+        weights = np.zeros(0)
         if tangents.start:
             curved = _curved(tangents, between, applied)
             weights = start_weights(extremal, tangents.start, curved, len(moving))
-        shares = ca.diag(ca.DM(_shares(fine, product, given)[np.array(moving, dtype=np.intp) % st.nu]))
+        shares = ca.diag(ca.DM(_shares(fine, applied)[np.array(moving, dtype=np.intp) % st.nu]))
         metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
         root = _root(ca.diagcat(metric, ca.diag(ca.DM(weights))))
-        rows = _by_v(tangents, *between.backward(*_split(fine, np.asarray(jacobian(*given).full()))), root)
+        rows = _by_v(tangents, *between.backward(*_split(fine, held_rows(jacobian, held.entries, fine, given))), root)
         if not np.isfinite(rows).all():
             return None
         at_bounds = np.flatnonzero(touching * tangents.free)
@@ -353,10 +362,10 @@ def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], 
     return product_with
 
 
-def _seconds(product: ca.Function, given: tuple[Any, ...]) -> float:
-    """How long one product with a direction takes [s]."""
+def _seconds(product: Callable[[Array], Array], size: int) -> float:
+    """How long one product with a direction of this size takes [s]."""
     begin = time.perf_counter()
-    product(*given, np.zeros(product.size1_in(product.n_in() - 1)))
+    product(np.zeros(size))
     return max(time.perf_counter() - begin, float(np.finfo(float).tiny))
 
 
@@ -376,7 +385,7 @@ def _curved(tangents: Tangents, between: Between, product: Callable[[Array], Arr
     return along
 
 
-def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:
+def _shares(fine: Extremal, product: Callable[[Array], Array]) -> Array:
     """Units of the metric (nu,): 1, or where they are far apart the roots of the curvature of each control by itself.
 
     Beside a control in units of 1e-7 one in units of 1 would have no curvature but rounding.
@@ -389,21 +398,11 @@ def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Arr
     for i in range(count):
         direction = np.zeros(first + u.size)
         direction[first + i :: count] = 1.0
-        roots[i] = np.sqrt(abs(direction @ np.asarray(product(*given, direction).full()).ravel()))
+        roots[i] = np.sqrt(abs(direction @ product(direction)))
     own = roots[roots > 0]
     if not own.size or own.max() <= FAR_APART * own.min():
         return np.ones(count)
     return np.where(roots > 0, roots / own.mean(), 1.0)
-
-
-def null_space(rows: Array, size: int) -> Array:
-    """Orthonormal basis of the vectors of some size that are across all rows, whatever the units of each row."""
-    lengths = np.linalg.norm(rows, axis=1)
-    kept = rows[lengths > 0] / lengths[lengths > 0][:, None]
-    if not kept.shape[0]:
-        return np.eye(size)
-    _, values, vectors = np.linalg.svd(kept)
-    return np.asarray(vectors[int(np.sum(values > DEPENDENT * values[0])) :].T)
 
 
 def _root(metric: ca.DM) -> ca.DM:
@@ -415,7 +414,8 @@ def _root(metric: ca.DM) -> ca.DM:
 def _solved(triangular: ca.DM, columns: Array) -> Array:
     """The inverse of a sparse triangular matrix times some columns."""
     right = ca.MX.sym("right", *columns.shape)
-    return np.asarray(ca.Function("solved", [right], [ca.solve(triangular, right)])(columns).full())
+    (found,) = Matrices(ca.Function("solved", [right], [ca.solve(triangular, right)])).evaluated(columns)
+    return found
 
 
 def _by_v(tangents: Tangents, by_z: Array, by_u: Array, root: ca.DM) -> Array:
@@ -482,7 +482,7 @@ def held_jacobian(extremal: Extremal) -> Array:
     everything = np.ones(extremal.trajectory.u.shape, dtype=bool)
     everything[extremal.mesh.idle] = False
     tangents = tangents_along(extremal, everything, feedback=False)
-    rows = np.asarray(jacobian(*arguments(fine, _costates(fine, through=True))).full())
+    rows = held_rows(jacobian, held.strictly, fine, arguments(fine, _costates(fine, through=True)))
     slopes = _between(extremal, fine).backward(*_split(fine, rows))
     by_v = _by_v(tangents, *slopes, ca.DM.eye(tangents.size))
     result = np.zeros((by_v.shape[0], everything.size))

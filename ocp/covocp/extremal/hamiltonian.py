@@ -18,6 +18,8 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.slope_terms import absolute_terms
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 
@@ -45,29 +47,40 @@ def hamiltonian(
     Returns:
         make(name, select): `select(H, x, u, e, t)` gives the outputs, expressions in the statement's own symbols.
     """
-    symbolic: Any = statement.symbolic
-    sizes = {"x": statement.nx, "u": statement.nu, "e": statement.ne, "t": 1, "T": 1, "p": statement.np}
-    symbols = {name: symbolic.sym(name, size) for name, size in sizes.items()}
-    costate_x, costate_e = symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)
-    rates, matrix_rates, running = statement.rates(*symbols.values())
+    symbols, (rates, matrix_rates, running) = _rates(statement)
+    costate_x, costate_e = symbols[6:]
     value = ca.dot(costate_x, rates) + (ca.dot(costate_e, matrix_rates) if matrices else 0) + (running if cost else 0)
 
     def make(name: str, select: Callable[..., list[Any]]) -> ca.Function:
-        outputs = select(value, symbols["x"], symbols["u"], symbols["e"], symbols["t"])
-        return ca.Function(name, [*symbols.values(), costate_x, costate_e], [ca.densify(v) for v in outputs])
+        outputs = select(value, *symbols[:4])
+        return ca.Function(name, symbols, [ca.densify(v) for v in outputs])
 
     return make
 
 
 @lru_cache(maxsize=KEPT)
+def _rates(statement: Statement) -> tuple[list[Expr], tuple[Expr, ...]]:
+    """Symbols of the arguments of H; rates of the states and of the half-vectors, running cost: written out once."""
+    symbolic: Any = statement.symbolic
+    symbols = model_symbols(statement)
+    costates = [symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)]
+    return [*symbols, *costates], tuple(statement.rates(*symbols))
+
+
+@lru_cache(maxsize=KEPT)
 def by_controls(statement: Statement) -> ca.Function:
-    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu; no function is made twice of one statement."""
+    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu, absolute terms of H_u (`slope_terms`).
 
-    def select(h: Expr, x: Expr, u: Expr, e: Expr, t: Expr) -> list[Any]:
-        slope = ca.gradient(h, u)
-        return [h, slope, ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)]
-
-    return hamiltonian(statement)("by_controls", select)
+    No function is made twice of one statement.
+    """
+    symbols, parts = _rates(statement)
+    rates, weights, u = ca.vertcat(*parts), ca.vertcat(*symbols[6:], 1), symbols[1]
+    h = ca.dot(weights, rates)
+    by_u = ca.jacobian(rates, u)  # of the few rates with a control in them: H itself goes through all
+    slope = by_u.T @ weights if statement.symbolic is ca.SX else ca.gradient(h, u)
+    bend = ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)
+    outputs = [h, slope, bend, absolute_terms(by_u, weights)]
+    return ca.Function("by_controls", symbols, [ca.densify(v) for v in outputs])
 
 
 def duration_slope(statement: Statement) -> ca.Function:

@@ -62,12 +62,13 @@ def _sees_matrices(statement: Statement, held: Entries) -> bool:
 
 
 @lru_cache(maxsize=4)
-def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Function, ca.Function]:
+def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Function, ca.Function | None]:
     """The Hessian of the Lagrangian times a direction, and the Jacobian of what is held.
 
     Returns:
-        (*arguments, direction) -> the product; (*arguments) -> Jacobian of the rows held. Directions and columns: the
-        nodes one after the other, then the controls.
+        (*arguments, direction) -> the product; (*arguments) -> Jacobian of the rows held that are no states, None
+        where there are none (`held_rows` has all of them). Directions and columns: the nodes one after the other, then
+        the controls.
     """
     st, n = statement, mesh.intervals
     size = node_size(st)
@@ -97,7 +98,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
             cost += matrix_cost
     value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])
     value += ca.dot(final, x[:, -1]) + ca.dot(final_e, e[:, -1]) + ca.dot(states, x) + ca.dot(matrices, e)
-    rows = {"final": x[:, -1], "final_matrices": seen[:, -1], "states": x, "matrices": seen}
+    rows = {"final_matrices": seen[:, -1], "matrices": seen}
     at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1])
     time = duration * ca.DM(mesh.nodes).T
     for kind, conditions, weights, at in (
@@ -117,13 +118,40 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         value += ca.dot(weights, part.conditions.columns(places, duration, p))
         own_rows.append(part.conditions.columns(places._replace(matrices=seen[:, k]), duration, p))
     rows["instants"] = ca.vertcat(ca.MX(0, 1), *own_rows)
-    kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
+    kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions and kind not in OF_STATES]
     inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices, none]
     direction = ca.MX.sym("direction", w.shape[0])
     gradient = ca.gradient((1 + none[0]) * value, w)
     product = ca.densify(ca.forward([gradient], [w, none], [[direction, ca.repmat(none[1], 2, 1)]])[0][0])
-    jacobian = ca.jacobian(ca.vertcat(ca.MX(0, 1), *kept), w)
-    return ca.Function("product", [*inputs, direction], [product]), ca.Function("held", inputs, [jacobian])
+    function = ca.Function("product", [*inputs, direction], [product])
+    if not kept:
+        return function, None
+    return function, ca.Function("held", inputs, [ca.jacobian(ca.vertcat(*kept), w)])
+
+
+def held_rows(jacobian: ca.Function | None, held: Entries, extremal: Extremal, given: tuple[Any, ...]) -> Array:
+    """Slopes of the rows held by nodes and controls one after the other, (rows, entries of both).
+
+    Args:
+        jacobian: that `second_order` gives of them.
+        held: the rows.
+        extremal: at whose nodes they are.
+        given: arguments of the former.
+    """
+    st, n = extremal.statement, extremal.mesh.intervals
+    size = node_size(st)
+    result = np.zeros((sum(len(positions) for _, positions in held), size * (n + 1) + extremal.trajectory.u.size))
+    others = np.zeros((0, result.shape[1])) if jacobian is None else np.asarray(jacobian(*given).full())
+    first, taken = 0, 0
+    for kind, positions in held:
+        at, count = first + np.arange(len(positions)), len(positions)
+        if kind in OF_STATES:
+            node, state = np.divmod(np.array(positions, dtype=np.intp), st.nx) if kind == "states" else (n, positions)
+            result[at, np.asarray(node * size + np.asarray(state, dtype=np.intp))] = 1.0
+        else:
+            result[at], taken = others[taken : taken + count], taken + count
+        first += count
+    return result
 
 
 def slopes_of_intervals(extremal: Extremal) -> tuple[Array, Array, Array]:

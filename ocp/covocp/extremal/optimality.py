@@ -31,7 +31,7 @@ from covocp.extremal.mesh_error import node_error
 from covocp.extremal.nodes import mapped
 from covocp.extremal.path_limits import acting
 from covocp.extremal.readings import stretches
-from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.extremal.slope_terms import slope_sizes
 from covocp.extremal.worth import worth_telling
 from covocp.statement.interval import model_symbols
 from covocp.transcription.scales import choose_scales
@@ -293,8 +293,7 @@ class _AtNodes(NamedTuple):
 def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     """The Hamiltonian and its slopes at the nodes."""
     st = extremal.statement
-    h, slope, curvature = along(by_controls(st), extremal, costates)
-    (size,) = along(slope_terms(st), extremal, costates)
+    h, slope, curvature, size = along(by_controls(st), extremal, costates)
     curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
     rates, matrix_rates, running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())
     terms = np.abs(costates.state * rates.T).sum(axis=1) + np.abs(costates.matrices * matrix_rates.T).sum(axis=1)

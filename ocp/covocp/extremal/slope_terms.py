@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 
@@ -21,8 +22,13 @@ def slope_terms(statement: Statement) -> ca.Function:
     sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np, statement.nx, statement.ne)
     symbols = [symbolic.sym(f"a{i}", size) for i, size in enumerate(sizes)]
     slopes = ca.jacobian(ca.vertcat(*statement.rates(*symbols[:6])), symbols[1])
-    weights = ca.vertcat(symbols[6], symbols[7], 1)
-    return ca.Function("slope_terms", symbols, [ca.densify(ca.fabs(slopes).T @ ca.fabs(weights))])
+    return ca.Function("slope_terms", symbols, [absolute_terms(slopes, ca.vertcat(symbols[6], symbols[7], 1))])
+
+
+def absolute_terms(slopes: Expr, weights: Expr) -> Any:
+    """The same of the slopes of rates and running cost by the controls, (nx + ne + 1, nu), and their weights in H."""
+    sizes: Any = ca.fabs(slopes)
+    return ca.densify(sizes.T @ ca.fabs(weights))
 
 
 def slope_sizes(terms: Array, curvature: Array, controls: Array) -> Array:
