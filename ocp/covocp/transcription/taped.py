@@ -11,6 +11,7 @@ import casadi as ca
 
 from covocp.base.expressions import Expr
 from covocp.passage.written import Tape
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import nominal_run, shoot
@@ -21,7 +22,10 @@ class Variables(Protocol):
 
     w: Any
     p: Any
-    intervals: Any
+
+    @property
+    def intervals(self) -> Interval:
+        """Of the mesh."""
 
 
 class Taped:
