@@ -69,7 +69,9 @@ class _Kept:
 def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
     """A sparsity so many times side by side."""
     rows, columns = shape.shape
-    return ca.Sparsity.dense(rows, columns * count) if shape.is_dense() else ca.repmat(shape, 1, count)
+    if shape.is_dense():
+        return ca.Sparsity.dense(rows, columns * count)
+    return ca.repmat(shape, 1, count) if shape.nnz() else ca.Sparsity(rows, columns * count)
 
 
 class _Columns(Node):

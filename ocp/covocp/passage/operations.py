@@ -92,6 +92,8 @@ def read_at_once(function: ca.Function) -> Program | None:
         starts = np.arange(max(numbers.size - 4 * count + 1, 0))
         for place, kind in zip(places, kinds, strict=True):
             starts = starts[numbers[starts + 4 * place] == kind]
+            if not starts.size:
+                break
         for start in starts.tolist():
             listed = _listed(numbers[start : start + 4 * count].reshape(count, 4))
             if listed is not None and _agrees(listed, function, places.tolist()):

@@ -17,7 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
 from covocp.solution.known_links import KnownLink, check_links
-from covocp.solution.report import refinement, sections, starts_told, stated_first, without_problem
+from covocp.solution.report import refinement, sections, starts_told, stated_first, untried_told, without_problem
 from covocp.solution.sample import Sample, asked_times
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
@@ -265,6 +265,8 @@ class PhasesSolution:
             effort.append(Sentence(starts_told(self.stats["starts"])))
         if self.stats.get("tried", 1) > 1:
             effort.append(Sentence(f"{self.stats['tried']} starts tried"))
+        if "untried" in self.stats:
+            effort.append(Sentence(untried_told(self.stats["untried"])))
         violated = [[name, number(value, 4)] for name, value in stated_first(self.violations)]
         limits: Section = [Table(columns=["violated constraint", "by"], rows=violated)] if violated else []
         phases = [section for phase in self.phases for section in sections(phase)]

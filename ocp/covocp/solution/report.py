@@ -388,6 +388,11 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
+def untried_told(count: int) -> str:
+    """What is not known where a limit has ended the comparison of starts."""
+    return f"the limit of time or iterations came before {_counted(count, 'other start')} could be compared"
+
+
 def _effort(solution: Solution) -> Section:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
@@ -406,6 +411,8 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{'found' if solution.converged else 'nor found'} by {stats[OTHERWISE]}")
     if stats.get("tried", 1) > 1 and solution.within is None:
         effort.append(f"{stats['tried']} starts tried")
+    if "untried" in stats and solution.within is None:
+        effort.append(untried_told(stats["untried"]))
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
     if "starts" in stats and solution.within is None:

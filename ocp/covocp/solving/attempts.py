@@ -150,6 +150,7 @@ class _Runs:
     tried: list[tuple[Outcome, Guess]] = field(default_factory=list)
     refused: list[OutsideDomainError] = field(default_factory=list)
     trusted: bool = False
+    left: int = 0  # rivals that a limit of time or iterations has left without an outcome
 
     __repr__ = short_repr
 
@@ -178,14 +179,17 @@ class _Runs:
         for rival in rivals:
             led = self._led(rival)
             self.trusted |= led is not None and _as_told(led, rival)
-        for rival in rivals:
+        for count, rival in enumerate(rivals):
             if self.reporter.stop:
+                self.left += len(rivals) - count
                 break
             least = min((cost_of(one) for one, _ in self.tried if one.converged), default=np.inf)
             certain = self._led(rival) is not None or (self.trusted and rival.about >= least)
             if not certain and not (rival.alike and self._falls_to_best(rival)):
                 outcome = self.run(rival)
-                self.trusted |= outcome is not None and outcome.converged and _as_told(outcome, rival)
+                met = outcome is not None and outcome.converged
+                self.trusted |= met and _as_told(outcome, rival)
+                self.left += int(not met and bool(self.reporter.stop))
 
     def _falls_to_best(self, rival: Guess) -> bool:
         """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley.
@@ -216,6 +220,12 @@ class _Runs:
         """The cheapest outcome with the counts of all; where none converged that of the last start that is no rival."""
         if not self.tried:
             raise self.refused[0]
+        outcome, guess = self._best()
+        if self.left and outcome.converged:
+            outcome = replace(outcome, stats={**outcome.stats, "untried": self.left})
+        return outcome, guess
+
+    def _best(self) -> tuple[Outcome, Guess]:
         converged = [one for one in self.tried if one[0].converged]
         if any(guess.rival for _, guess in self.tried) and converged:
             outcome, guess = min(converged, key=lambda one: cost_of(one[0]))

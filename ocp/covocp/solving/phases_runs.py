@@ -202,14 +202,20 @@ class ChainRuns:
             start = self._begun(begun.options, attempt + 1).guesses
         if not outcome.converged and outcome.stats.get("wandered") and not self._reporter.stop:
             outcome = prepared.solve(values, first, self._reporter)
-        for rival in beside:
+        left = 0
+        for count, rival in enumerate(beside):
             if self._reporter.stop:
+                left += len(beside) - count
                 break
             again, tried = prepared.solve(values, rival, self._reporter), tried + 1
+            left += int(not again.converged and bool(self._reporter.stop))
             better = again.converged and (not outcome.converged or again.cost < outcome.cost)
             found = again if better else outcome
             outcome = replace(found, stats={**found.stats, **counted(outcome, again)})
-        return replace(outcome, stats={**outcome.stats, "tried": tried}) if tried > 1 else outcome
+        told = {"tried": tried} if tried > 1 else {}
+        if left and outcome.converged:
+            told["untried"] = left
+        return replace(outcome, stats={**outcome.stats, **told})
 
     def _sides(self, begun: Begun) -> list[Guesses]:
         """The start, and those whose phases are bent to other sides, that are worth a run beside it."""

@@ -150,7 +150,9 @@ class _Variables:
         values = times(ca.MX(ca.DM(np.concatenate(units))), self.w)
         x, e, u, duration = (values[i:j] for i, j in pairwise(ends))
         self.p = ca.MX.sym("p", statement.np + 1)
-        self.parameters, self.cost_scale = self.p[: statement.np], self.p[statement.np]
+        # of one entry CasADi's empty part is a row
+        self.parameters = self.p[: statement.np] if statement.np else ca.MX(0, 1)
+        self.cost_scale = self.p[statement.np]
         self.x = ca.reshape(x, nx, count)
         self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count)
         if self.e is not None and statement.tied is not None and statement.tied.matrices:
