@@ -88,6 +88,8 @@ def _running(nlp: NLP, trajectory: Trajectory, parameters: Array) -> tuple[Array
     """Curvature of the running cost by the control values, (nodes, nu, nu), and their weights in time, (nodes, nu)."""
     st, mesh = nlp.statement, nlp.mesh
     nodes, nu = mesh.control_nodes, st.nu
+    if not nu:
+        return np.zeros((nodes, 0, 0)), np.zeros((nodes, 0))
     q = quadrature_weights(mesh) * trajectory.duration
     units = np.broadcast_to(nlp.scales.u, (nodes, nu))
     u = at_nodes(trajectory.u, nodes)

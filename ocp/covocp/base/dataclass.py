@@ -8,6 +8,7 @@ fields in a way that costs when it runs: it is compiled at the first constructio
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import MISSING, Field, FrozenInstanceError
@@ -40,11 +41,11 @@ class _LaterInit:
 def _compiled_init(cls: type[Any]) -> Any:
     """The constructor of a frozen dataclass, with the signature that Python's own has."""
     own = dataclasses.fields(cls)
-    names: dict[str, Any] = {"__name__": cls.__module__, "_set": object.__setattr__, "_FACTORY": _FACTORY}
+    names: dict[str, Any] = {"_set": object.__setattr__, "_FACTORY": _FACTORY}
     by_position: list[str] = []
     by_name: list[str] = []
     lines: list[str] = []
-    for f in own:
+    for f in own:  # in a function that has the defaults, as Python's own is made
         value, argument = f.name, f.name
         if f.default_factory is not MISSING:
             names[f"_make_{f.name}"] = f.default_factory
@@ -58,12 +59,15 @@ def _compiled_init(cls: type[Any]) -> Any:
             argument = f"{f.name}=_default_{f.name}"
         if f.init:
             (by_name if f.kw_only else by_position).append(argument)
-        lines.append(f" _set(self, {f.name!r}, {value})\n")
+        lines.append(f"  _set(self, {f.name!r}, {value})\n")
     if hasattr(cls, "__post_init__"):
-        lines.append(" self.__post_init__()\n")
+        lines.append("  self.__post_init__()\n")
     arguments = ", ".join(["self", *by_position, *(["*", *by_name] if by_name else [])])
-    exec(f"def __init__({arguments}):\n{''.join(lines) or ' pass'}", names)
-    init = names.pop("__init__")
+    made: dict[str, Any] = {}
+    body = "".join(lines) or "  pass\n"
+    text = f"def make({', '.join(names)}):\n def __init__({arguments}):\n{body} return __init__"
+    exec(text, vars(sys.modules[cls.__module__]), made)  # of its module: annotations are resolved there
+    init = made["make"](**names)
     given = [f for kw_only in (False, True) for f in own if f.init and f.kw_only == kw_only]
     init.__annotations__ = {**{f.name: f.type for f in given}, "return": None}
     return init

@@ -77,7 +77,8 @@ def by_controls(statement: Statement) -> ca.Function:
     rates, weights, u = ca.vertcat(*parts), ca.vertcat(*symbols[6:], 1), symbols[1]
     h = ca.dot(weights, rates)
     by_u = ca.jacobian(rates, u)  # of the few rates with a control in them: H itself goes through all
-    slope = by_u.T @ weights if statement.symbolic is ca.SX else ca.gradient(h, u)
+    # dense: a control may be in no rate, and CasADi takes no symmetric Jacobian of what has structural zeros
+    slope = ca.densify(by_u.T @ weights) if statement.symbolic is ca.SX else ca.gradient(h, u)
     bend = ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)
     outputs = [h, slope, bend, absolute_terms(by_u, weights)]
     return ca.Function("by_controls", symbols, [ca.densify(v) for v in outputs])

@@ -94,7 +94,8 @@ def tied_values(problem: Declarations) -> Tied | None:
     groups = [[q.symbol for q in problem.states], [q.symbol for q in _fixed(problem)]]
     x, of_state = _split("state", groups[0])
     p, of_parameters = _split("parameters", groups[1])
-    chosen = [outputs[0][list(states)], outputs[2][list(matrices)]]
+    # of a column of one entry CasADi's empty part is a row
+    chosen = [outputs[i][list(rows)] if rows else ca.MX(0, 1) for i, rows in ((0, states), (2, matrices))]
     function = ca.Function("tied", [*groups[0], *groups[1]], chosen)
     values = function.call([*of_state, *of_parameters], True, False)
     return Tied(

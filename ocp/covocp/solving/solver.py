@@ -95,7 +95,6 @@ class Solver(ClassicalRuns):
         **options: Any,
     ) -> None:
         """Build the statement and make the method ready."""
-
         begin = time.perf_counter()
         check_method(method)
         check_problem(problem)
