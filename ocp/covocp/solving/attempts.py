@@ -187,9 +187,10 @@ class _Runs:
             certain = self._led(rival) is not None or (self.trusted and rival.about >= least)
             if not certain and not (rival.alike and self._falls_to_best(rival)):
                 outcome = self.run(rival)
-                met = outcome is not None and outcome.converged
-                self.trusted |= met and _as_told(outcome, rival)
-                self.left += int(not met and bool(self.reporter.stop))
+                if outcome is not None and outcome.converged:
+                    self.trusted |= _as_told(outcome, rival)
+                elif self.reporter.stop:
+                    self.left += 1
 
     def _falls_to_best(self, rival: Guess) -> bool:
         """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley.
