@@ -122,11 +122,12 @@ def test_a_gain_is_no_kink_of_the_user() -> None:
         assert bent or not told
 
 
-@pytest.mark.parametrize("limit", [0.6, 0.7])
+@pytest.mark.parametrize("limit", [0.5, 0.6, 0.7])
 def test_what_an_integral_may_be_is_missed_by_what_is_missing(limit):
     """An oscillator is brought to v(T) = 0: int u^2 >= (p0 sin T - v0 cos T)^2 / int cos^2, by Cauchy and Schwarz.
 
-    From 0.7 the run goes to the largest number of iterations, from 0.6 it converges to a point of local infeasibility.
+    From 0.7 some runs go to the largest number of iterations: what their last iterates miss in the integral they may
+    miss in other rows too; the others converge to a point of local infeasibility.
     """
     T, p0, v0 = 4.5, 1.42607113, 0.01696409
     problem = co.Problem(T, "oscillator")
@@ -140,7 +141,10 @@ def test_what_an_integral_may_be_is_missed_by_what_is_missing(limit):
     with pytest.raises(co.SolveError, match="the constraints may contradict") as told:
         co.solve(problem, intervals=40, progress=False)
     least = (p0 * np.sin(T) - v0 * np.cos(T)) ** 2 / (T / 2 + np.sin(2 * T) / 4)
-    assert told.value.violations["battery"] == pytest.approx(least - limit, rel=0.1)
+    missed = told.value.violations["battery"]
+    assert 0.0 < missed < 1.1 * (least - limit)
+    if "local infeasibility" in str(told.value):
+        assert missed == pytest.approx(least - limit, rel=1e-3)
     assert re.search(r"largest violation:\n +battery: 0", str(told.value))
 
 
