@@ -47,8 +47,6 @@ CASES = {
     "chain": (mass_chain.problem, 20, {"initial_y": 0.05}),
     "Bryson-Denham": (bryson_denham.problem, 20, {"initial_x": 0.01, "initial_v": 0.95}),
     "brachistochrone": (brachistochrone.problem, 10, {"initial_y": 0.05}),
-    # From some starts the quadratic subproblems give up along the singular arc (1.00195), and the status says so.
-    "Goddard": (goddard_rocket.problem, 10, {"initial_h": 1.0018}),
     "regulator": (lqg_double_integrator.problem, 12, {"initial_position": 1.2}),
     "free time": (free_time_integrator.problem, 10, {"initial_x": 0.1}),
     "Mars entry": (mars_entry.problem, 8, {"initial_h": 1.02 * 328000.0, "initial_v": 0.98 * 15000.0}),
@@ -65,23 +63,37 @@ def moved(problem, starts):
     return problem
 
 
+def optimum(problem, plan, **options):
+    """The least cost on the nodes of a plan, from its controls."""
+    guess = {control.name: plan[control.name] for control in problem.controls}  # of two mirror images this one
+    nodes = plan["time"].ravel() / plan["time"].ravel()[-1]  # a mesh graded for the start of the export stays so
+    return co.solve(problem, grid=nodes, guess=guess, progress=False, plugin_options=TIGHT, **options).cost
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_costs_are_those_of_the_converged_optimum(case):
     make, intervals, changes = CASES[case]
-    mesh = {"intervals": intervals, "substeps": 2}
-    short = {"qpsol_options": {"max_iter": 150, "error_on_fail": False, **SILENT}} if case == "Goddard" else {}
-    made = export_c(make(), FOLDER / f"cost_{list(CASES).index(case)}", **mesh, plugin_options=short)
-    planner = made.reference()
+    planner = export_c(make(), FOLDER / f"cost_{list(CASES).index(case)}", intervals=intervals, substeps=2).reference()
     for given in ({}, changes):
         plan = planner(**given)
-        if case == "Goddard" and given and planner.status == "NOT_CONVERGED":
-            continue  # rounding decides whether it gives up, and the status says so
         assert planner.status == "OK"
-        problem = moved(make(), given)
-        guess = {control.name: plan[control.name] for control in problem.controls}  # of two mirror images this one
-        nodes = plan["time"].ravel() / plan["time"].ravel()[-1]  # a mesh graded for the start of the export stays so
-        solution = co.solve(problem, substeps=2, grid=nodes, guess=guess, progress=False, plugin_options=TIGHT)
-        assert plan["cost"] == pytest.approx(solution.cost, rel=SAME, abs=0.0)
+        assert plan["cost"] == pytest.approx(optimum(moved(make(), given), plan, substeps=2), rel=SAME, abs=0.0)
+
+
+def test_plans_along_a_singular_arc_are_right_or_told():
+    """From which starts the quadratic subproblems give up there is a matter of rounding; the status says so."""
+    short = {"qpsol_options": {"max_iter": 150, "error_on_fail": False, **SILENT}}
+    made = export_c(goddard_rocket.problem(), FOLDER / "arc", intervals=10, substeps=2, plugin_options=short)
+    planner, found = made.reference(), []
+    for start in ({}, *({"initial_h": height} for height in np.linspace(1.0003, 1.0021, 7).tolist())):
+        plan = planner(**start)
+        found.append(planner.status)
+        if planner.status == "OK":
+            least = optimum(moved(goddard_rocket.problem(), start), plan, substeps=2)
+            assert plan["cost"] == pytest.approx(least, rel=SAME, abs=0.0)
+    assert set(found) <= {"OK", "NOT_CONVERGED"}
+    assert found[0] == "OK"
+    assert found.count("OK") >= 3
 
 
 @pytest.mark.needs_cc
@@ -123,11 +135,12 @@ def test_steps_that_have_c_code_are_exact_in_any_units():
     np.testing.assert_allclose(found, exact, rtol=1e-13)
 
 
-@pytest.mark.parametrize("start", [{}, {"initial_x": 1.5}, {"initial_x": -1.5}])
-def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimum(start):
+@pytest.mark.parametrize("start", [{}, {"initial_x": 1.5}, {"initial_x": -1.5}, {"initial_x": 1.0}])
+@pytest.mark.parametrize("method", ["sqpmethod", "ipopt"])
+def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimum(method, start):
     """Its cost is two, its curvature in units of the variables two thousand: the first slopes led astray.
 
-    From other starts rounding decides whether the iterations suffice; where they do not, the status says so.
+    From other starts the approximate Hessian of `sqpmethod` may creep: what it then leaves is not called OK.
     """
 
     def make():
@@ -139,13 +152,9 @@ def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimu
         ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
         return ocp
 
-    folder = FOLDER / f"prior_{len(start)}_{sum(start.values()) > 0}"
-    planner = export_c(make(), folder, intervals=20).reference()
+    folder = FOLDER / f"prior_{method}_{sum(start.values())}"
+    planner = export_c(make(), folder, intervals=20, method=method).reference()
     plan = planner(**start)
-    if start and planner.status == "NOT_CONVERGED":
-        return
-    assert planner.status == "OK"
-    nodes = plan["time"].ravel() / plan["time"].ravel()[-1]
-    guess = {"u": plan["u"]}
-    solution = co.solve(moved(make(), start), grid=nodes, guess=guess, progress=False, plugin_options=TIGHT)
-    assert float(plan["cost"]) == pytest.approx(solution.cost, rel=SAME)
+    right = float(plan["cost"]) == pytest.approx(optimum(moved(make(), start), plan), rel=SAME)
+    assert planner.status == ("OK" if right else "NOT_CONVERGED")
+    assert right or (start and method == "sqpmethod")
