@@ -55,12 +55,14 @@ over = _operation(ca.OP_DIV, operator.truediv)
 
 
 def above(values: Sequence[Expr]) -> Any:
-    """Columns one above the other; to join one alone takes as long as many operations."""
-    return values[0] if len(values) == 1 else ca.vertcat(ca.MX(0, 1) if not values else values[0], *values[1:])
+    """Columns one above the other, an empty one of none; to join one alone takes as long as many operations."""
+    if len(values) == 1:
+        return values[0]
+    return ca.vertcat(*values) if values else ca.MX(0, 1)
 
 
 def beside(values: Sequence[Expr]) -> Any:
-    """The same side by side."""
+    """One or more side by side."""
     return values[0] if len(values) == 1 else ca.horzcat(*values)
 
 

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, above
 from covocp.problem.decisions import check_matrix, decisions_of
 from covocp.problem.declarations import Constraint, Declarations, Place
 from covocp.statement.entries import entry_names, half_names
@@ -116,7 +116,7 @@ def _outputs(problem: Declarations) -> list[Any]:
         [nan if m.initial is None else m.initial for m, nan in pairs],
         [nan if m.final is None else m.final for m, nan in pairs],
     )
-    return [group[0] if len(group) == 1 else ca.vertcat(ca.MX(0, 1), *group) for group in groups]
+    return [above(group) for group in groups]
 
 
 def _fixed(problem: Declarations) -> list[Any]:
