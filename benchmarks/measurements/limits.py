@@ -23,7 +23,7 @@ import covocp as co
 from covocp.base.buffered import Buffered
 from covocp.base.matrices import half_length
 from covocp.models import mass_chain, unknown_lag
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import entries_of, passed_by
 
 SWEEPS, AGAIN, PENDULUM_INTERVALS = 20, 100, 20
 
@@ -42,7 +42,7 @@ def sweep_seconds(rows: int, steps: int) -> float:
     half = half_length(rows)
     e, wide = ca.MX.sym("e", half), ca.repmat(H.sparsity(), 1, steps)
     points = [ca.MX.sym(name, wide) for name in ("h1", "h2")]
-    passed = passed_by(e, points, rows)
+    passed = passed_by(e, entries_of(points, rows))
     value = passed[half - 1, -1] + passed[half - 3, -1]
     slopes = [ca.jtimes(value, point, ca.DM(1.0), True) for point in points]
     both = Buffered(ca.Function("both", [e, *points], [value, *slopes]))

@@ -15,7 +15,7 @@ from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
 from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpack_symbolic
 from covocp.base.quadrature import gauss_matrix, riccati_step
 from covocp.passage import library
-from covocp.passage.sweep import Told, depends, passed_by
+from covocp.passage.sweep import Told, depends, entries_of, passed_by
 from covocp.transcription import shooting
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -47,7 +47,7 @@ def node(n: int, rows: int, passing=passed_by) -> tuple[list[ca.MX], ca.MX]:
     shapes = [(half_length(n), 1), *[(2 * n, 2 * n * len(MOVES))] * 2, (rows * n + half_length(rows), len(READS))]
     arguments = [ca.MX.sym(f"a{i}", *shape) for i, shape in enumerate([*shapes, (half_length(n), STEPS)])]
     told = Told(steps=READS, rows=rows, columns=arguments[3])
-    return arguments, passing(arguments[0], arguments[1:3], n, arguments[4], told)
+    return arguments, passing(arguments[0], entries_of(arguments[1:3], n), arguments[4], told)
 
 
 def by_casadi(n: int, rows: int, arguments: list[ca.MX]) -> ca.MX:
@@ -117,7 +117,9 @@ def test_any_accuracy_in_exact_arithmetic(variance):
     spread = sum(m * s for m, s in zip(M, seen, strict=True)) + Fraction(variance)
     exact = np.array([[float(E[i][j] - seen[i] * seen[j] / spread) for j in range(2)] for i in range(2)])
     told = Told(steps=(0,), rows=1, columns=ca.DM([1.0, 1.0, variance]))
-    found = unpack(np.asarray(passed_by(ca.DM([4.0, 1.0, 3.0]), [ca.DM(4, 0)] * 2, 2, None, told).full()).T, 2)[0]
+    found = unpack(
+        np.asarray(passed_by(ca.DM([4.0, 1.0, 3.0]), entries_of([ca.DM(4, 0)] * 2, 2), None, told).full()).T, 2
+    )[0]
     np.testing.assert_allclose(found, exact, rtol=1e-14)
     assert np.linalg.eigvalsh(found).min() >= -1e-15
 
@@ -125,7 +127,7 @@ def test_any_accuracy_in_exact_arithmetic(variance):
 def test_slopes_by_an_accurate_reading_keep_their_digits():
     """E+ = E R / (E + R) of one state: slopes R^2/(E + R)^2, E^2/(E + R)^2 and -2 E^2 R M/(M^2 E + R)^2."""
     e, told = ca.MX.sym("e"), ca.MX.sym("told", 2)
-    passed = passed_by(e, [ca.DM(2, 0)] * 2, 1, None, Told(steps=(0,), rows=1, columns=told))
+    passed = passed_by(e, entries_of([ca.DM(2, 0)] * 2, 1), None, Told(steps=(0,), rows=1, columns=told))
     slopes = ca.Function("f", [e, told], [ca.gradient(passed, e), ca.gradient(passed, told)])
     E, R = 3.0, 1e-12
     by_e, by_told = (np.asarray(v.full()).ravel() for v in slopes(E, [1.0, R]))
@@ -228,7 +230,7 @@ def test_what_only_readings_change_depends_on_them():
     n, rows = 2, 1
     first, told = ca.MX(half_length(n), 1), ca.MX.sym("told", rows * n + half_length(rows))
     still = ca.MX(2 * n, 2 * n * 2)
-    dependence = depends(first, (still, still), n, told=Told(steps=(1,), rows=rows, columns=told))
+    dependence = depends(first, entries_of((still, still), n), told=Told(steps=(1,), rows=rows, columns=told))
     pattern = np.asarray(ca.DM(ca.jacobian_sparsity(dependence, told), 1).full()) != 0
     assert not pattern[: half_length(n)].any()
     assert pattern[half_length(n) :].all()

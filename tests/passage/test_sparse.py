@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from covocp.base.matrices import half_length, pack, unpack
 from covocp.passage import library, ordering, sweep
-from covocp.passage.sweep import _Sweep, passed_by
+from covocp.passage.sweep import _Sweep, entries_of, passed_by
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
@@ -69,7 +69,7 @@ def passages(monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity) -> list[ca.F
         wide = ca.repmat(pattern, 1, STEPS)
         arguments = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
         seeds, along = ca.MX.sym("s", half_length(n), STEPS), [ca.MX.sym("d", a.sparsity()) for a in arguments]
-        after = passed_by(arguments[0], arguments[1:], n)
+        after = passed_by(arguments[0], entries_of(arguments[1:], n))
         slopes = [ca.jtimes(after, a, seeds, True) for a in arguments]
         moved: list[ca.MX] = [
             sum((ca.jtimes(slope, a, d) for a, d in zip(arguments, along, strict=True)), ca.MX(0)) for slope in slopes
@@ -203,7 +203,7 @@ def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows, most):
     own = ca.MX.sym("s", half_length(n), count // every)
     made = kept(n, tuple(map(tuple, pattern.get_triplet())), count, False, (), 0, False, every)
     monkeypatch.setattr(sweep, "_sweep", lambda *given: made)
-    after = passed_by(a[0], a[1:], n, every=every)
+    after = passed_by(a[0], entries_of(a[1:], n), every=every)
     function = ca.Function("f", [*a, own], [after, *(ca.jtimes(after, x, own, True) for x in a)])
     E = prior(n)
     given = [pack(E), *(ca.project(ca.DM(k), wide) for k in both)]
@@ -273,7 +273,7 @@ def test_a_large_chain_is_the_differential_equation():
     errors = []
     for count in (10, 20, 40):
         H = ca.sparsify(ca.DM(np.block([[-F.T, W], [Q, F]]) / count))
-        passed = passed_by(ca.DM(pack(E)), [ca.repmat(H, 1, count)] * 2, n)
+        passed = passed_by(ca.DM(pack(E)), entries_of([ca.repmat(H, 1, count)] * 2, n))
         last = unpack(np.asarray(ca.DM(passed).full())[:, -1], n)
         errors.append(np.abs(last - exact).max())
     assert errors[2] < 1e-5 * np.abs(exact).max()

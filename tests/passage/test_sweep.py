@@ -16,7 +16,7 @@ from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpac
 from covocp.base.quadrature import gauss_matrix, riccati_step
 from covocp.models import mars_entry, mass_chain
 from covocp.passage import library
-from covocp.passage.sweep import _sweep, depends, passed_by, values_by
+from covocp.passage.sweep import _sweep, depends, entries_of, passed_by, values_by
 from covocp.transcription import shooting
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -48,7 +48,7 @@ def node(n: int, *, kicked: bool = False, every: int = 1) -> tuple[list[ca.MX], 
     ]
     if kicked:
         arguments.append(ca.MX.sym("kicks", half_length(n), STEPS // every))
-    return arguments, passed_by(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
+    return arguments, passed_by(arguments[0], entries_of(arguments[1:3], n), *arguments[3:], every=every)
 
 
 def by_casadi(n: int, arguments: list[ca.MX], every: int = 1) -> ca.MX:
@@ -102,7 +102,7 @@ def test_a_long_passage_is_the_differential_equation():
     errors = []
     for count in (20, 40):
         H = np.tile(np.block([[-F.T, W], [Q, F]]) / count, count)
-        passed = passed_by(ca.DM(pack(E0)), [ca.DM(H), ca.DM(H)], 3)
+        passed = passed_by(ca.DM(pack(E0)), entries_of([ca.DM(H), ca.DM(H)], 3))
         errors.append(np.abs(unpack(np.asarray(passed.full()).T, 3)[-1] - exact).max())
     assert errors[1] < 1e-6
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.2)
@@ -223,8 +223,8 @@ def test_values_alone_are_those_that_have_slopes(kicked, every):
     n = 4
     E, h1, h2 = systems(n, 4)
     arguments, passed = node(n, kicked=kicked, every=every)
-    alone = values_by(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
-    seen = depends(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
+    alone = values_by(arguments[0], entries_of(arguments[1:3], n), *arguments[3:], every=every)
+    seen = depends(arguments[0], entries_of(arguments[1:3], n), *arguments[3:], every=every)
     assert seen.shape == alone.shape == passed.shape == (half_length(n), STEPS // every)
     given = [pack(E), h1, h2, 1e-3 * np.ones(passed.shape)][: len(arguments)]
     one, other = ca.Function("f", arguments, [passed, alone])(*given)
@@ -279,7 +279,7 @@ def test_several_directions_at_once():
 def test_a_step_that_cannot_be_taken_gives_no_numbers():
     """X is singular: E + 1 = 0 with W = 1; CasADi's operations fail there, numbers must not look right."""
     H = ca.DM([[0.0, 1.0], [0.0, 0.0]])
-    passed = passed_by(ca.DM([-1.0]), [ca.repmat(H, 1, STEPS)] * 2, 1)
+    passed = passed_by(ca.DM([-1.0]), entries_of([ca.repmat(H, 1, STEPS)] * 2, 1))
     assert not np.isfinite(np.asarray(passed.full())).any()
 
 

@@ -24,7 +24,7 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.readings import Readings, readings_along
 from covocp.passage.library import functions
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import entries_of, passed_by
 from covocp.statement.interval import Interval, one_sided, repeated
 from covocp.statement.statement import Loop, Statement
 from covocp.transcription.covariance_steps import KEPT, moving_step
@@ -133,7 +133,7 @@ class _Course:
             if begin <= entry.interval < end
         }
         if functions() is not None and not jumps:
-            passed = passed_by(ca.DM(pack(first)), points, size)
+            passed = passed_by(ca.DM(pack(first)), entries_of(points, size))
             return np.asarray(unpack(np.asarray(ca.DM(passed).full()).T, size))
         values = [first]
         for k, D in enumerate(_transitions(points, size), begin * m):

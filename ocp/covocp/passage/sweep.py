@@ -14,6 +14,7 @@ from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_length
 from covocp.base.nodes import Buffers, Node
+from covocp.base.short_repr import short_repr
 from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
@@ -41,10 +42,24 @@ class Told:
     columns: Any
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Entries:
+    """h H of Gauss steps by what may be nonzero in it.
+
+    size: n of the covariance. pattern: rows and columns of the entries. first, second: at both points, a column a step.
+    """
+
+    size: int
+    pattern: Pattern
+    first: Any
+    second: Any
+
+    __repr__ = short_repr
+
+
 def passed_by(
     first: Expr,
-    points: Sequence[Expr],
-    size: int,
+    entries: Entries,
     kicks: Expr = None,
     told: Told | None = None,
     *,
@@ -55,8 +70,7 @@ def passed_by(
 
     Args:
         first: half-vector at the start.
-        points: h H of all Gauss steps side by side, at the first and at the second point, of one sparsity each step.
-        size: of the covariance.
+        entries: of h H of all Gauss steps.
         kicks: added to the half-vectors as they pass, a column for each of those that are returned; None: nothing.
         told: what is read; None: nothing.
         every: after how many steps, each time, a half-vector is wanted; a share of their number.
@@ -66,13 +80,13 @@ def passed_by(
         A column for each of them. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps;
         not where it is lean), but its sparsity is not seen: no Jacobians of it.
     """
-    pattern, given = entries(points, size)
     steps, height = ((), 0) if told is None else (told.steps, told.rows)
-    numbers = isinstance(first, ca.DM) and all(isinstance(point, ca.DM) for point in points)
-    count = given[0].shape[1] + len(steps)
-    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, lean or numbers, every)
+    given = (first, entries.first, entries.second)
+    lean = lean or all(isinstance(one, ca.DM) for one in given)
+    count = entries.first.shape[1] + len(steps)
+    sweep = _sweep(entries.size, entries.pattern, count, kicks is not None, steps, height, lean, every)
     others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
-    return sweep(first, *given, *others)
+    return sweep(*given, *others)
 
 
 values_by = partial(passed_by, lean=True)
@@ -106,22 +120,19 @@ def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Patter
     return result
 
 
-def entries(points: Sequence[Expr], size: int) -> tuple[Pattern, list[Any]]:
-    """Rows and columns of what may be nonzero in some step, and what is there at both points, a column a step."""
+def entries_of(points: Sequence[Expr], size: int) -> Entries:
+    """Entries of h H of steps, from the matrices (2n, 2n) of all steps side by side, at the first and second point."""
     rows, columns = _pattern(points, size)
     moves = points[0].shape[1] // (2 * size)
     dense = ca.Sparsity.dense(len(rows), moves)
     wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, moves)
-    given = [ca.sparsity_cast(ca.project(point, wide), dense) for point in points]
-    return (tuple(rows), tuple(columns)), given
+    first, second = (ca.sparsity_cast(ca.project(point, wide), dense) for point in points)
+    return Entries(size=size, pattern=(tuple(rows), tuple(columns)), first=first, second=second)
 
 
-def depends(
-    first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None, *, every: int = 1
-) -> Any:
+def depends(first: Expr, entries: Entries, kicks: Expr = None, told: Told | None = None, *, every: int = 1) -> Any:
     """Something that depends on what `passed_by` depends on, by operations whose sparsity CasADi sees."""
-    moves = points[0].shape[1] // (2 * size)
-    each: Any = sum(ca.sum1(ca.reshape(ca.sum1(point), 2 * size, moves)) for point in points)
+    each: Any = ca.sum1(entries.first) + ca.sum1(entries.second)
     if told is not None:
         both = ca.horzcat(each, ca.sum1(told.columns))
         order = np.argsort([*(k for k in range(both.shape[1]) if k not in set(told.steps)), *told.steps])
@@ -131,7 +142,7 @@ def depends(
     if kicks is not None:
         each = each + ca.sum1(kicks)
     # without `densify` CasADi's sums along a row end where its first entry is structurally zero
-    return ca.repmat(ca.sum1(first) + ca.cumsum(ca.densify(each), 1), half_length(size), 1)
+    return ca.repmat(ca.sum1(first) + ca.cumsum(ca.densify(each), 1), half_length(entries.size), 1)
 
 
 def _pattern(points: Sequence[Expr], size: int) -> tuple[list[int], list[int]]:

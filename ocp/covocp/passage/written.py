@@ -7,7 +7,6 @@ function of CasADi's without a body, which `bodies` gives.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -22,7 +21,7 @@ from covocp.base.nodes import Buffers, Node
 from covocp.base.short_repr import short_repr
 from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
-from covocp.passage.sweep import Told, entries
+from covocp.passage.sweep import Entries, Told
 
 # What the bodies call, in the order in which C must see it.
 SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "few.h", "back.h", "places.h", "written.h")
@@ -86,8 +85,7 @@ class Tape:
     def passed_by(
         self,
         first: Expr,
-        points: Sequence[Expr],
-        size: int,
+        entries: Entries,
         kicks: Expr = None,
         told: Told | None = None,
         *,
@@ -96,7 +94,7 @@ class Tape:
         """What `covocp.passage.sweep.passed_by` returns, of a symbol."""
         assert kicks is None  # nothing that is exported has them, nor readings
         assert told is None
-        pattern, given = entries(points, size)
+        size, pattern, given = entries.size, entries.pattern, [entries.first, entries.second]
         count = given[0].shape[1]
         if self._form == "evaluated":
             forward, slopes = _evaluated(size, pattern, count)

@@ -26,6 +26,7 @@ from covocp.base.expressions import Expr, times
 from covocp.base.linear_solve import LINEAR_SOLVER, SCALAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_arrivals, gauss_matrix, hermite, riccati_step
+from covocp.passage.shape import Pattern
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.rosenbrock import between
@@ -82,6 +83,18 @@ def gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Functio
         drift, noise, information = form(*interval.at(c, known[:, j]))
         points.append(times(interval.h, ca.blockcat([[-drift.T, information], [noise, drift]])))
     return ca.Function("gauss_points", [xa, xb, *interval], points, slopes_wanted(statement, 2))
+
+
+@lru_cache(maxsize=KEPT)
+def gauss_entries(statement: Statement, index: int, step: StepKind) -> tuple[ca.Function, Pattern]:
+    """`gauss_points` by what of h H may be nonzero at one of the points, a column for each; rows and columns of it."""
+    function = gauss_points(statement, index, step)
+    symbols: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+    pattern = function.sparsity_out(0) + function.sparsity_out(1)
+    column = ca.Sparsity.dense(pattern.nnz(), 1)
+    points = [ca.sparsity_cast(ca.project(point, pattern), column) for point in function.call(symbols)]
+    rows, columns = pattern.get_triplet()
+    return ca.Function("gauss_entries", symbols, points, slopes_wanted(statement, 2)), (tuple(rows), tuple(columns))
 
 
 def _hermite_points(statement: Statement, xa: Expr, xb: Expr, interval: Interval) -> Expr:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -11,11 +10,10 @@ import numpy as np
 from covocp.base.buffered import Buffered, Matrices
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
-from covocp.passage.shape import Pattern
 from covocp.passage.sweep import from_many
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import KEPT, StepKind, fed, gauss_points
+from covocp.transcription.covariance_steps import KEPT, StepKind, fed, gauss_entries
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import NUMERIC_ENTRIES, at_columns
 from covocp.transcription.shooting import compiled_steps, interval_columns
@@ -98,7 +96,7 @@ def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Inte
         for i in positions:
             block = st.matrices[i]
             own = slice(nx + block.span.start, nx + block.span.stop)
-            function, pattern = _entries(st, i, mesh.step)
+            function, pattern = gauss_entries(st, i, mesh.step)
             h = Buffered(at_columns(st, mesh, function, n * count))(*rows)
             if h is None:
                 raise RuntimeError(f"{function.name()} failed")
@@ -107,19 +105,6 @@ def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Inte
                 values[:, :-1, own] = after[:, ::-1]
             else:
                 values[:, 1:, own] = after
-
-
-@lru_cache(maxsize=KEPT)
-def _entries(statement: Statement, index: int, step: StepKind) -> tuple[ca.Function, Pattern]:
-    """What of h H may be nonzero at both Gauss points of a step, and its rows and columns."""
-    function = gauss_points(statement, index, step)
-    one, two = (function.sparsity_out(i) for i in range(2))
-    if one != two:
-        symbols: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
-        outputs = [ca.project(value, one + two) for value in function.call(symbols)]
-        function = ca.Function(function.name(), symbols, outputs)
-    rows, columns = function.sparsity_out(0).get_triplet()
-    return function, (tuple(rows), tuple(columns))
 
 
 @lru_cache(maxsize=KEPT)

@@ -14,9 +14,10 @@ from covocp.base.expressions import Expr, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import half_length
 from covocp.passage.columns import in_columns
-from covocp.passage.sweep import Told
+from covocp.passage.shape import Pattern
+from covocp.passage.sweep import Entries, Told
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import fed, gauss_points, moving_step, propagate_step, step_matrix
+from covocp.transcription.covariance_steps import fed, gauss_entries, moving_step, propagate_step, step_matrix
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import read_by, read_step, runge_kutta_step, told_at
 
@@ -103,8 +104,9 @@ def _steps(
         return lambda columns, _: (list(columns), partial(_accumulated, step))
     if passage is not None:
         sizes = [statement.matrices[i].size for i in positions]
-        kinds = [gauss_points(statement, i, mesh.step) for i in positions]
-        run = partial(_compiled, passage, sizes, kicked, every)
+        found = [gauss_entries(statement, i, mesh.step) for i in positions]
+        kinds = [function for function, _ in found]
+        run = partial(_compiled, passage, sizes, [pattern for _, pattern in found], kicked, every)
         return lambda columns, count: (
             [h for kind in kinds for h in at_columns(statement, mesh, kind, count).call(list(columns))],
             run,
@@ -122,19 +124,22 @@ def _steps(
 def _compiled(
     passing: Callable[..., Any],
     sizes: list[int],
+    patterns: list[Pattern],
     kicked: bool,
     every: int,
     first: Expr,
     arguments: list[Any],
     count: int,
 ) -> list[Any]:
-    """What `_accumulated` gives, by the compiled passage: arguments are h H of each matrix at both Gauss points."""
+    """What `_accumulated` gives, by the compiled passage: arguments are entries of h H at both points of each."""
     kicks = arguments[-1] if kicked else None
     ends = np.cumsum([0, *(half_length(size) for size in sizes)]).tolist()
     parts = []
-    for k, (size, (i, j)) in enumerate(zip(sizes, pairwise(ends), strict=True)):
+    for k, (size, pattern, (i, j)) in enumerate(zip(sizes, patterns, pairwise(ends), strict=True)):
         own = None if kicks is None else kicks[i:j, :]
-        parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own, every=every))
+        one, two = arguments[2 * k : 2 * k + 2]
+        points = Entries(size=size, pattern=pattern, first=one, second=two)
+        parts.append(passing(first[i:j], points, own, every=every))
     passed = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
     return [passed] if kicks is None else [passed, passed - kicks]
 
@@ -175,15 +180,15 @@ def _reading_passage(
     chosen = [column[:, reads] for column in (columns[0], *columns[2:])]
     height = max(len(group) for group in statement.samples.groups)
     told = Told(steps=steps, rows=height, columns=told_at(statement).map(len(reads))(*chosen))
-    function = at_columns(statement, mesh, gauss_points(statement, position, mesh.step), len(moving))
-    points = function.call([c[:, moving] for c in columns])
-    size = statement.matrices[position].size
+    kind, pattern = gauss_entries(statement, position, mesh.step)
+    one, two = at_columns(statement, mesh, kind, len(moving)).call([c[:, moving] for c in columns])
+    points = Entries(size=statement.matrices[position].size, pattern=pattern, first=one, second=two)
     if kicks is None:
-        values = passage(first, points, size, None, told)[:, last.tolist()]
+        values = passage(first, points, None, told)[:, last.tolist()]
         return values, values
     later = ca.MX(first.shape[0], int(last[-1]) + 1)
     later[:, last[mesh.substeps - 1 :: mesh.substeps].tolist()] = kicks
-    passed = passage(first, points, size, ca.densify(later), told)[:, last.tolist()]
+    passed = passage(first, points, ca.densify(later), told)[:, last.tolist()]
     at_nodes = ca.MX(first.shape[0], count)
     at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
     return passed - at_nodes, passed
