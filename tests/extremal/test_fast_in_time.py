@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import covocp as co
-from covocp.base.turns import may_turn_often
 from covocp.extremal.mesh_error import node_error
+from covocp.extremal.turns import may_turn_often
 from covocp.extremal.unseen import FEW, changes_within_steps
 
 DURATION, INTERVALS = 10.0, 50

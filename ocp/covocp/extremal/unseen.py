@@ -13,9 +13,9 @@ from functools import lru_cache
 import numpy as np
 
 from covocp.base.matrices import Array
-from covocp.base.turns import may_turn_often
 from covocp.extremal.dense_output import mapped
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.turns import may_turn_often
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT

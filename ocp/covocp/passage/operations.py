@@ -26,7 +26,7 @@ _PAIRS = frozenset(
     {"ADD", "SUB", "MUL", "DIV", "POW", "LT", "LE", "EQ", "NE", "AND", "OR", "FMOD", "COPYSIGN", "IF_ELSE_ZERO"}
     | {"FMIN", "FMAX", "ATAN2", "HYPOT", "INPUT", "OUTPUT"}
 )
-_OF_TWO = np.array([name in _PAIRS for name in KINDS])
+OF_TWO = np.array([name in _PAIRS for name in KINDS])
 
 # Of each operation its kind and three numbers, as in columns.h, and its constant.
 Program = tuple[NDArray[np.intc], Array]
@@ -112,7 +112,7 @@ def _listed(records: NDArray[np.int32]) -> Program | None:
     rows = np.column_stack([kinds, records[:, 2], records[:, 3], records[:, 1]])
     outputs, constants = kinds == OUTPUT, kinds == CONSTANT
     rows[outputs, 1:] = records[outputs][:, [2, 1, 3]]
-    rows[~_OF_TWO[kinds], 2] = 0
+    rows[~OF_TWO[kinds], 2] = 0
     rows[constants, 1] = 0
     values = np.zeros(kinds.size)
     values[constants] = np.ascontiguousarray(records[constants, 2:]).view("<f8").ravel()
