@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined, with_parts
 from covocp.extremal.hamiltonian import by_controls
+from covocp.extremal.inside import controlled_nodes
 from covocp.statement.interval import repeated
 
 # A truth value for each control of each interval.
@@ -28,6 +30,8 @@ SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 # up and down; by how much more the cost falls with the best control, whose difference from the form is taken for
 # s^2 - s + 1/6 (linear) or s - 1/2 (constant) in each interval.
 HAT, STEP = (1.0 / 3.0, 64.0 / 15.0), (1.0 / 4.0, 4.0 / 3.0)
+# A multiplier of a control bound above this share of the largest slope counts the bound as active.
+ACTIVE = 1e-5
 # Share of its range within which a control counts as at a bound.
 AT_BOUND = 1e-2
 # Parts of an interval whose ends a polynomial goes through, and its values in the middles of many equal parts.
@@ -35,6 +39,41 @@ PARTS, MANY = 4, 64
 SAMPLES = np.vander((np.arange(MANY) + 0.5) / MANY, PARTS + 1) @ np.linalg.inv(
     np.vander(np.arange(PARTS + 1) / PARTS, PARTS + 1)
 )
+
+
+class Kinds(NamedTuple):
+    """Which controls count, and how.
+
+    Attributes:
+        nodes: free at the nodes, (N + 1, nu).
+        free: in each interval free in all of it, (N, nu).
+        bounded: at a bound somewhere in it.
+    """
+
+    nodes: Mask
+    free: Mask
+    bounded: Mask
+
+
+def kinds_of(extremal: Extremal) -> Kinds:
+    """Controls that count: none where they act beside H_u."""
+    slopes, beside = discrete_costates(extremal)[1], _beside(extremal)[:, None]
+    free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0)
+    if free.shape[0] == extremal.mesh.intervals:
+        free = np.vstack([free, free[-1:]])
+    free = free & ~beside
+    whole = free[:-1] & free[1:]
+    return Kinds(nodes=free, free=whole, bounded=~whole & ~(beside[:-1] | beside[1:]))
+
+
+def _beside(extremal: Extremal) -> Mask:
+    """Nodes whose control acts beside H_u: through what is read there at an instant, or in a condition there."""
+    result = np.zeros(extremal.mesh.intervals + 1, dtype=bool)
+    result[controlled_nodes(extremal)] = True
+    samples = extremal.statement.samples
+    if samples is not None and any(samples.measurement.jac_sparsity(i, 1).nnz() for i in (1, 2)):
+        result[extremal.mesh.instants] = True
+    return result
 
 
 def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: float) -> float | None:

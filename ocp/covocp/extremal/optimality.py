@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from covocp.base.dataclass import dataclass
 from covocp.base.errors import warn_user
@@ -15,7 +14,7 @@ from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.closed_loop import ClosedLoop
-from covocp.extremal.control_error import estimate_control_error
+from covocp.extremal.control_error import ACTIVE, estimate_control_error, kinds_of
 from covocp.extremal.cost_sizes import ZERO_COST, absolute_cost, variable_cost
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
@@ -24,7 +23,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.finer_cost import change_on_finer_mesh
 from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope
-from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
+from covocp.extremal.inside import instant_control_slopes, instant_duration_slope
 from covocp.extremal.jumps import met_jumps
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
@@ -37,8 +36,6 @@ from covocp.statement.interval import model_symbols
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
 
-# A multiplier of a control bound above this share of the largest slope counts the bound as active.
-ACTIVE = 1e-5
 # A stationarity above which it is asked what it does to the cost.
 LARGE_SLOPE = 1e-5
 # Terms of H over the time, in the duality gap, up to which they are those of multipliers that the solver left.
@@ -153,7 +150,6 @@ def assess(
     _, slopes, _ = discrete_costates(extremal)
     scale = max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)
     left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
-    free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     others = 0.0 if within is None else within.size
     size, gap = absolute_cost(extremal) + others, duality_gap(extremal)
     control_slope: float | None = 0.0
@@ -161,14 +157,10 @@ def assess(
     if st.nu and acting(extremal):
         known = change_on_finer_mesh(extremal, max(size, gap), within)
         control_slope, control_error = None, np.nan if known is None else known
-    elif st.nu and free is not None:
-        free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
-        beside = _beside(extremal)[:, None]
-        free = free & ~beside
-        control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2))) / scale
-        whole = free[:-1] & free[1:]
-        bounded = ~whole & ~(beside[:-1] | beside[1:])
-        control_error = estimate_control_error(extremal, (whole, bounded), max(size, gap))
+    elif st.nu:
+        kinds = kinds_of(extremal)
+        control_slope = float(np.sqrt(np.mean(np.where(kinds.nodes, slope, 0.0) ** 2))) / scale
+        control_error = estimate_control_error(extremal, (kinds.free, kinds.bounded), max(size, gap))
     found = Optimality(
         stationarity=_stationarity(extremal, left, scale, within) if st.nu else 0.0,
         control_slope=control_slope,
@@ -345,16 +337,6 @@ def _variation(extremal: Extremal, values: Array) -> float:
     """Variation of H relative to its terms; where something is read or holds at an instant it may jump."""
     largest = float(np.max([np.ptp(values[part, 0]) for part in stretches(extremal)]))
     return largest / max(float(values[:, 1].max()), np.finfo(float).tiny)
-
-
-def _beside(extremal: Extremal) -> NDArray[np.bool_]:
-    """Nodes whose control acts beside H_u: through what is read there at an instant, or in a condition there."""
-    result = np.zeros(extremal.mesh.intervals + 1, dtype=bool)
-    result[controlled_nodes(extremal)] = True
-    samples = extremal.statement.samples
-    if samples is not None and any(samples.measurement.jac_sparsity(i, 1).nnz() for i in (1, 2)):
-        result[extremal.mesh.instants] = True
-    return result
 
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array, within: Within | None) -> float:

@@ -92,10 +92,27 @@ def acting(extremal: Extremal) -> dict[str, float]:
     """
     if not limited(extremal):
         return {}
-    extremal = refined(extremal)  # limits act at all its nodes
-    st, steps = extremal.statement, np.diff(extremal.mesh.nodes)
+    steps = np.diff(refined(extremal).mesh.nodes)
     shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
-    bounded = st.bounded_states
+    found: dict[str, float] = {}
+    for name, at in _near(extremal):
+        if at.any():
+            found[name] = max(float(shares @ at), found.get(name, 0.0))
+    return found
+
+
+def acting_nodes(extremal: Extremal) -> NDArray[np.bool_]:
+    """Points of the mesh at which limits are imposed, and one of them acts."""
+    result = np.zeros(extremal.mesh.intervals * extremal.mesh.points + 1, dtype=bool)
+    for _, at in _near(extremal) if limited(extremal) else ():
+        result |= at
+    return result
+
+
+def _near(extremal: Extremal) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Each state with bounds and each condition along the path, and at which points it is at a limit."""
+    extremal = refined(extremal)  # limits act at all its nodes
+    st, bounded = extremal.statement, extremal.statement.bounded_states
     near = _touching(extremal.trajectory.x[:, bounded], *(bound[bounded] for bound in st.state_bounds))
     near[[0, -1]] = False
     rows = [(st.state_names[i], near[:, j]) for j, i in enumerate(bounded)]
@@ -103,11 +120,7 @@ def acting(extremal: Extremal) -> dict[str, float]:
         if place == "path":
             near = _touching(values, conditions.lower, conditions.upper)
             rows += [(name, near[:, j]) for j, name in enumerate(conditions.names)]
-    found: dict[str, float] = {}
-    for name, at in rows:
-        if at.any():
-            found[name] = max(float(shares @ at), found.get(name, 0.0))
-    return found
+    return rows
 
 
 def _touching(values: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:

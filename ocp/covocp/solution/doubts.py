@@ -9,7 +9,10 @@ import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
 from covocp.base.residuals import LEFT, MUCH_LEFT
+from covocp.extremal.coarse_controls import cost_of_form
+from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import without_value
+from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
@@ -31,6 +34,9 @@ LOST_LOOP = (
 OWN_SLOPES, NOT_STATIONARY = "gradient", 1e-3
 # Share of their magnitudes below which the controls do nothing.
 NOTHING = 1e-6
+# Shares of the cost: what the form of the controls may take without a word, and from where on its estimate is crude.
+COARSE_CONTROLS, FAR_OFF = 1e-2, 0.3
+REFINE = "Let refine=1e-4 put nodes where they are needed, or use more intervals."
 REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
 
 
@@ -67,6 +73,8 @@ def mention_doubts(solution: Solution) -> None:
     mention_spread(solution)
     if not jumps:
         _mention_slopes(solution, fine)
+        if solution.optimised and solution.statement is not None:
+            mention_form(solution.extremal, solution.within)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         other = "" if solution.mesh.step in ("gauss", "rodas") else "covariance_step='gauss' or "
@@ -74,6 +82,28 @@ def mention_doubts(solution: Solution) -> None:
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             f"{other}more intervals."
         )
+
+
+def mention_form(extremal: Extremal, within: Within | None = None, remedy: str = REFINE) -> None:
+    """Warn of controls that turn faster than their nodes can say, where that costs much.
+
+    Args:
+        extremal: the solution.
+        within: what the rest of a chain says of it.
+        remedy: what helps, a sentence.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            paid = cost_of_form(extremal, within)
+    except (CovocpError, RuntimeError, ArithmeticError, ValueError):  # the report says that it is not known
+        return
+    if paid is None or not paid > COARSE_CONTROLS:
+        return
+    much = f"about {paid:.1e} of the cost" if paid < FAR_OFF else "much of the cost, or a multiple of it"
+    warn_user(
+        "The controls turn faster than the mesh lets them: that they are linear between its nodes costs "
+        f"{much} (optimality.control_error). {remedy}"
+    )
 
 
 def mention_gap(stats: Mapping[str, Any]) -> None:

@@ -22,7 +22,7 @@ from covocp.extremal.given_controls import evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
-from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
+from covocp.solution.doubts import mention_doubts, mention_form, mention_gap, mention_limits
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, counted, from_starts, interrupted, mention_left, with_stats
@@ -259,6 +259,7 @@ class Solver(ClassicalRuns):
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
+                nominal = outcome
                 if self.nominal == "deterministic":
                     outcome = self._closed(outcome, values, reporter)
             if reporter.asked:
@@ -269,6 +270,8 @@ class Solver(ClassicalRuns):
                 return self._timed(self._finish(outcome, first, allow_failure=True, assess=assess), begin)
             outcome = with_stalled(outcome, reporter)
             solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
+            if assess and nominal is not outcome and nominal.converged and solution.converged:
+                mention_form(nominal.extremal, remedy="Use more intervals.")
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 
     def _timed(self, solution: Solution, begin: float) -> Solution:
