@@ -28,7 +28,7 @@ def cost_of_form(extremal: Extremal, within: Within | None = None) -> float | No
         As `Optimality.control_error`, where no limit acts; None where the controls are smooth, or nothing is known.
     """
     st = extremal.statement
-    if not st.nu or extremal.mesh.control != "linear" or not (_turning(extremal) > STEEP).any():
+    if not st.nu or extremal.mesh.control != "linear" or not are_steep(extremal):
         return None
     from covocp.extremal.control_error import estimate_control_error, kinds_of
     from covocp.extremal.cost_sizes import absolute_cost
@@ -41,6 +41,11 @@ def cost_of_form(extremal: Extremal, within: Within | None = None) -> float | No
     others = 0.0 if within is None else within.size
     size = max(absolute_cost(extremal) + others, duality_gap(extremal))
     return estimate_control_error(extremal, (kinds.free & ~held, kinds.bounded & ~held), size)
+
+
+def are_steep(extremal: Extremal) -> bool:
+    """Whether a control leaves a straight line within an interval by much of its range."""
+    return bool((_turning(extremal) > STEEP).any())
 
 
 def _turning(extremal: Extremal) -> Array:

@@ -147,9 +147,7 @@ def assess(
     """
     st = extremal.statement
     slope, curvature, values, sizes = _at_nodes(extremal, costates)
-    _, slopes, _ = discrete_costates(extremal)
     scale = max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)
-    left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
     others = 0.0 if within is None else within.size
     size, gap = absolute_cost(extremal) + others, duality_gap(extremal)
     control_slope: float | None = 0.0
@@ -162,7 +160,7 @@ def assess(
         control_slope = float(np.sqrt(np.mean(np.where(kinds.nodes, slope, 0.0) ** 2))) / scale
         control_error = estimate_control_error(extremal, (kinds.free, kinds.bounded), max(size, gap))
     found = Optimality(
-        stationarity=_stationarity(extremal, left, scale, within) if st.nu else 0.0,
+        stationarity=_stationarity(extremal, scale, within) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
@@ -192,8 +190,21 @@ def mention_saddle(curvature: float | None) -> None:
         )
 
 
-def _stationarity(extremal: Extremal, slopes: Array, scale: float, within: Within | None) -> float:
+def stationarity_of(extremal: Extremal) -> float:
+    """The stationarity of an extremal that is no part of a chain, without the other conditions.
+
+    Args:
+        extremal: with multipliers.
+    """
+    if not extremal.statement.nu:
+        return 0.0
+    sizes = _at_nodes(extremal, discrete_costates(extremal)[0]).sizes
+    return _stationarity(extremal, max(float(sizes.max(initial=0.0)), np.finfo(float).tiny), None)
+
+
+def _stationarity(extremal: Extremal, scale: float, within: Within | None) -> float:
     """The largest slope of the Lagrangian per unit of time in units of the terms of H_u, or all of them in the cost."""
+    slopes = discrete_costates(extremal)[1] + _limit_slopes(extremal) + extremal.multipliers.controls
     shares = quadrature_weights(extremal.mesh)[:, None]
     times = np.maximum(shares, shares.mean()) * extremal.trajectory.duration  # what acts for less time is not seen
     value = float((np.abs(slopes) / times).max(initial=0.0)) / scale

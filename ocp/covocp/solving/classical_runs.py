@@ -17,7 +17,7 @@ from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import cost_of, counted, from_starts, with_stats
 from covocp.solving.beside_classical import ClassicalDesign
 from covocp.solving.continued import again_on, continued
-from covocp.solving.from_classical import from_classical, patiently
+from covocp.solving.from_classical import at_classical, from_classical, patiently
 from covocp.solving.methods import method_options
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.statement import Statement
@@ -68,6 +68,13 @@ class ClassicalRuns:
         ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
         outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)
         return patiently(outcome, prepared, ready, values, reporter) if self._patient else (outcome, prepared)
+
+    def _at_classical(self, values: Array, reporter: Progress) -> Outcome | None:
+        """The nominal of the deterministic cost where it is the optimum for certain; None where a run must tell."""
+        if not self._patient or reporter.stop:
+            return None
+        found = at_classical(self.statement, self._prepared.mesh, self._classical.nominal(values), values)
+        return None if reporter.stop else found
 
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
         """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""

@@ -1,8 +1,8 @@
-"""Where a combined design that no run finds is had from the classical one.
+"""Combined designs that are had from the classical one: the optimum where both are one, else another start.
 
 A Hessian of limited memory does not see that a long nominal drifts far away where it is steered a little, and creeps;
 the deterministic problem has exact second derivatives. Where nominal and statistics separate its optimum is that of the
-expected cost, with its multipliers; elsewhere it is another place to start from.
+expected cost, with its multipliers; where it is the one of a quadratic program besides, no other way is tried first.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
+from covocp.extremal.coarse_controls import are_steep
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls
 from covocp.extremal.mesh_error import COARSE_MESH
@@ -29,6 +30,8 @@ from covocp.transcription.trajectory import Multipliers
 
 # Iterations after which a run that creeps is given up where the classical design is the optimum, and soon had.
 SOON = 100
+# Stationarity up to which slopes of controls that turn between two nodes are those of the sum on so few of them.
+UNRESOLVED = 0.5
 # Multipliers that both problems have; those of the matrices are the problem's own.
 SHARED = ("final", "end", "start", "instants", "path", "states", "controls", "inside_path", "inside_states")
 
@@ -60,20 +63,11 @@ def from_classical(
     if failed.converged or reporter.stop or not statement.behind or statement.coupled:
         return failed, prepared
     found = classical()
-    if found is None or not found.converged or reporter.stop:
+    around = None if found is None or reporter.stop else _around(statement, prepared.mesh, found, values)
+    if found is None or around is None:
         return failed, prepared
-    t, mesh = found.extremal.trajectory, prepared.mesh
-    if not np.array_equal(found.extremal.mesh.nodes, mesh.nodes) or t.u.shape[0] != mesh.control_nodes:
-        return failed, prepared
-    around = evaluate_controls(statement, replace(mesh, eliminated=True), t.u, t.duration, values, t.x[0], held=t.x)
-    if not around.converged:
-        return failed, prepared
-    counts = counted(failed, found)
-    if separates(statement) and (own := _multipliers(statement, mesh, found)) is not None:
-        extremal = replace(around.extremal, multipliers=own)
-        told = replace(around, extremal=extremal, message=found.message, violations=found.violations)
-        if _is_stationary(told):
-            return with_stats(told, **{**failed.stats, **found.stats, **counts}), prepared
+    if (told := _as_optimum(around, found)) is not None:
+        return with_stats(told, **{**failed.stats, **found.stats, **counted(failed, found)}), prepared
     try:
         again = ready()
         outcome = again.solve(values, Guess(trajectory=around.extremal.trajectory, warm=True), reporter)
@@ -81,6 +75,41 @@ def from_classical(
         return failed, prepared
     counts = counted(failed, outcome)
     return (with_stats(outcome, **counts), again) if outcome.converged else (with_stats(failed, **counts), prepared)
+
+
+def at_classical(statement: Statement, mesh: Mesh, found: Outcome | None, values: Array) -> Outcome | None:
+    """The optimum of the expected cost where that is the one of a quadratic program; None where it is not had so.
+
+    Args:
+        statement: the problem, `impatient`.
+        mesh: of the combined design.
+        found: the outcome of the deterministic problem; None where there is none.
+        values: of the parameters.
+    """
+    around = None if found is None or not mesh.eliminated else _around(statement, mesh, found, values)
+    told = None if found is None or around is None else _as_optimum(around, found)
+    return None if found is None or told is None else with_stats(told, **found.stats)
+
+
+def _around(statement: Statement, mesh: Mesh, found: Outcome, values: Array) -> Outcome | None:
+    """Filter and feedback around the nominal of the deterministic problem, on the mesh of the combined design."""
+    t = found.extremal.trajectory
+    alike = np.array_equal(found.extremal.mesh.nodes, mesh.nodes) and t.u.shape[0] == mesh.control_nodes
+    if not found.converged or not alike:
+        return None
+    around = evaluate_controls(statement, replace(mesh, eliminated=True), t.u, t.duration, values, t.x[0], held=t.x)
+    return around if around.converged else None
+
+
+def _as_optimum(around: Outcome, found: Outcome) -> Outcome | None:
+    """What runs around the nominal as the optimum of the expected cost, where it is stationary."""
+    statement, mesh = around.extremal.statement, around.extremal.mesh
+    own = _multipliers(statement, mesh, found) if separates(statement) else None
+    if own is None:
+        return None
+    extremal = replace(around.extremal, multipliers=own)
+    told = replace(around, extremal=extremal, message=found.message, violations=found.violations)
+    return told if _is_stationary(told) else None
 
 
 def patiently(
@@ -96,10 +125,18 @@ def patiently(
 
 
 def _is_stationary(outcome: Outcome) -> bool:
-    """Whether the expected cost is stationary there, too, up to what its steps leave: it is summed up otherwise."""
-    optimality = Solution.of(outcome, "ipopt").optimality
-    left = max(LIMIT, min(optimality.mesh_error, COARSE_MESH))
-    return bool(optimality.stationarity is not None and optimality.stationarity <= left)
+    """Whether the expected cost is stationary there, too, up to what its steps leave: it is summed up otherwise.
+
+    The optimum of a quadratic program is so by either sum, and no other point is better by more than these differ: a
+    slope counts by its square. Where controls turn between two nodes the sums have little in common.
+    """
+    solution = Solution.of(outcome, "ipopt")
+    left = max(LIMIT, min(solution.mesh_error, COARSE_MESH))
+    if impatient(outcome.extremal.statement):
+        left = max(left, float(np.sqrt(solution.mesh_error)), UNRESOLVED if are_steep(outcome.extremal) else 0.0)
+    from covocp.extremal.optimality import stationarity_of
+
+    return stationarity_of(outcome.extremal) <= left
 
 
 def _multipliers(statement: Statement, mesh: Mesh, found: Outcome) -> Multipliers | None:

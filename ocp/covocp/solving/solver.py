@@ -288,8 +288,11 @@ class Solver(ClassicalRuns):
         first, guess = gain_start(guess, reporter)
         if isinstance(guess, Later | Solution):
             self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
-        if assess and guess is None and first is None:
-            self._look_at_steps(values)
+        if guess is None and first is None:
+            if assess:
+                self._look_at_steps(values)
+            if (optimum := self._at_classical(values, reporter)) is not None:
+                return optimum, None
         found = None
         if isinstance(guess, Solution):
             own = first is guess
