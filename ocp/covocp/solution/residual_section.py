@@ -62,7 +62,7 @@ WORRIES: dict[str, tuple[float, str]] = {
     ),
     "mesh_error": (2e-4, STEPS),
     "node_error": (1e-2, STEPS),
-    "control_error": (1e-3, "large: the cost is off by about that: more intervals, refine=, or control='linear'"),
+    "control_error": (1e-3, "large: the cost is off by about that: more intervals, or refine="),
     "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
     "cross_covariance": (
         1e-2,
@@ -109,6 +109,8 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
+    if name == "control_error" and solution.mesh.control == "constant":
+        words += ", or control='linear'"
     return words if solution.converged and abs(value) > level else ""
 
 
