@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, as_array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LEFT, VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
@@ -480,7 +480,7 @@ class Runs:
 
 def _numbers(value: Any) -> Array:
     """What a solver gives, a matrix of CasADi's or an array, as numbers one after the other."""
-    return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).ravel()
+    return np.asarray(as_array(value), dtype=float).ravel()
 
 
 def share_for(times: float) -> float:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from covocp.base.matrices import (
+    as_array,
     distinct,
     half_indices,
     half_length,
@@ -190,3 +191,15 @@ def test_what_rounding_leaves_beside_a_large_variance_is_forgiven():
     assert is_semidefinite(np.array([[1e6, 1e-12], [1e-12, -1e-16]]))
     assert is_semidefinite(np.array([[1e6, 1e-12], [1e-12, 0.0]]))
     assert not is_semidefinite(np.array([[1e6, 1e-3], [1e-3, 0.0]]) + 1e-30 * np.eye(2))
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (50, 60), (1, 5000), (5000, 1), (0, 7)])
+def test_numbers_of_a_matrix_are_those_of_casadi(shape):
+    """Of a small and of a large one, dense and sparse, NaN and infinity among them; an array stays what it is."""
+    values = np.random.default_rng(1).normal(size=shape)
+    values.ravel()[3:9] = [0.0, np.nan, np.inf, -np.inf, -0.0, 1e-310][: max(values.size - 3, 0)]
+    given = ca.DM(values)
+    np.testing.assert_array_equal(as_array(given), values)
+    np.testing.assert_array_equal(np.signbit(as_array(given)), np.signbit(values))
+    np.testing.assert_array_equal(as_array(ca.sparsify(given)), values)
+    assert as_array(values) is values

@@ -23,7 +23,7 @@ import numpy as np
 from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
-from covocp.base.matrices import Array, pack_symbolic, stacked, unpack, unpack_symbolic
+from covocp.base.matrices import Array, as_array, pack_symbolic, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -212,7 +212,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     count = n * (m + 1)
     arguments = [column.reshape(count, -1).T for column in _points(extremal, fine)]
     own, true = (np.tile(p[:, None], (1, count)) for p in (extremal.parameters, statistics.parameters))
-    F, G = (np.asarray(v.full()) for v in loop_of(st).expansion.map(count)(*arguments, own)[:2])
+    F, G = (as_array(v) for v in loop_of(st).expansion.map(count)(*arguments, own)[:2])
     F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
     slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
     triangle = np.asarray(np.linalg.qr(slopes.T, mode="r"))  # of a few rows with thousands of columns
@@ -221,7 +221,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
     if not kept.shape[1]:
         return None
-    noise = np.asarray(statistics.density.map(count)(*arguments, true)[0].full()).reshape(size, count, size)
+    noise = as_array(statistics.density.map(count)(*arguments, true)[0]).reshape(size, count, size)
     growth = np.einsum("iw,ikj,jw->kw", kept, noise[uncertain][:, :, uncertain], kept).reshape(n, m + 1, -1)
     weights = np.array([simpson_weight(j, m) for j in range(m + 1)])
     grown = np.cumsum(np.einsum("k,j,kjw->kw", np.diff(extremal.time), weights, growth), axis=0)

@@ -18,7 +18,7 @@ from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, pack, stacked, unpack, unpack_symbolic
+from covocp.base.matrices import Array, as_array, pack, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -134,7 +134,7 @@ class _Course:
         }
         if functions() is not None and not jumps:
             passed = passed_by(ca.DM(pack(first)), entries_of(points, size))
-            return np.asarray(unpack(np.asarray(ca.DM(passed).full()).T, size))
+            return np.asarray(unpack(as_array(ca.DM(passed)).T, size))
         values = [first]
         for k, D in enumerate(_transitions(points, size), begin * m):
             value = lyapunov_after(D, values[-1])

@@ -14,7 +14,7 @@ import numpy as np
 from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.expressions import sequence_of
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, as_array
 from covocp.base.short_repr import short_repr
 from covocp.passage.sweep import values_by
 from covocp.statement.statement import Statement
@@ -114,7 +114,7 @@ class _Runs:
         st, mesh = self._statement, self._mesh
         kept = not st.matrices or compiled_steps(mesh)  # a long sequence of CasADi's steps takes memory for all of it
         if not kept or not self._often("segments"):
-            return [np.asarray(v.full()) for v in self._shot([ca.DM(array) for array in start])]
+            return [as_array(v) for v in self._shot([ca.DM(array) for array in start])]
         if self._made is None:
             symbols = [ca.MX.sym(name, *array.shape) for name, array in zip(_STARTS, start, strict=True)]
             self._made = Matrices(ca.Function("runs", symbols, self._shot(symbols)))
@@ -141,7 +141,7 @@ class _Runs:
         pieces = [ca.horzsplit(column, NUMERIC_RUN) for column in common]
         for length, *columns in zip(lengths, *pieces, strict=True):
             values.append(sequence_of(advance, length).call([values[-1][:, -1], *columns])[0])
-        return np.asarray(ca.horzcat(*values).full()).T
+        return as_array(ca.horzcat(*values)).T
 
 
 @lru_cache(maxsize=MESHES)
