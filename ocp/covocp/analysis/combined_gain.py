@@ -83,7 +83,10 @@ class Worth:
         if any(block.role == "decision" for block in self.classical.blocks):
             return "little to gain by the controls; decisions were held, and what others gain is not known"
         if self.gain < NOTHING and self.first_order < NOTHING:
-            return "nothing to gain: nominal and statistics separate here; the classical design will do"
+            statement = self.classical.statement
+            if statement is not None and separates(statement):
+                return "nothing to gain: nominal and statistics separate; the classical design will do"
+            return "nothing to gain along this nominal, which hardly moves the statistics; the classical design will do"
         return "little to gain: the classical design is nearly as good"
 
     def __str__(self) -> str:
