@@ -336,8 +336,10 @@ def test_figures_share_solutions_and_have_names_and_given_nominals(capsys, tmp_p
 def test_warnings_are_lines(capsys):
     code, _, err = run(capsys, "solve", "mass_chain", "--intervals", 10, "--option", "substeps=1")
     assert code == 0
-    assert err.startswith("covocp: warning: The mesh is too coarse")
-    assert len(err.splitlines()) == 1
+    lines = err.splitlines()
+    assert lines[0].startswith("covocp: warning: The mesh is too coarse")
+    assert lines[1].startswith("covocp: warning: The controls turn faster")
+    assert len(lines) == 2
 
 
 @pytest.mark.needs_cc

@@ -143,11 +143,13 @@ def test_a_limit_on_a_state_beside_a_large_penalty() -> None:
     assert found.optimality.complementarity < 1e-5
 
 
+@pytest.mark.filterwarnings("ignore:The controls turn faster")  # 20 intervals of a jump
 def test_what_no_run_makes_less_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
     with pytest.warns(co.CovocpWarning, match="The cost may be above the least one") as told:
         found = co.solve(penalised(1e8, unit=1.0, limit=3.0), intervals=20, progress=False)
-    bound = float(str(told[0].message).split("one: ")[1].split()[0])
+    (gap,) = (text for text in map(str, (one.message for one in told)) if "above the least one" in text)
+    bound = float(gap.split("one: ")[1].split()[0])
     assert 0.0 < 1 - 1 / (1 + 1e-8) / found.cost < bound
 
 
@@ -163,12 +165,13 @@ def halves() -> co.Phases:
     return co.Phases(parts)
 
 
+@pytest.mark.filterwarnings("ignore:The controls turn faster")  # 20 intervals of a jump
 def test_phases_hide_nothing_either_and_tell_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert co.solve(halves(), intervals=10, progress=False).cost == pytest.approx(1 / (1 + 1e-8), rel=1e-6)
     monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
     with pytest.warns(co.CovocpWarning, match="above the least one") as told:
         co.solve(halves(), intervals=10, progress=False)
-    assert len(told) == 1
+    assert sum("above the least one" in str(one.message) for one in told) == 1
 
 
 def correlated(seed: int) -> co.Problem:

@@ -8,39 +8,52 @@ from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.links import Within
 from covocp.extremal.path_limits import acting_nodes
+from covocp.transcription.scales import choose_scales
 
 # Share of its range by which a control turns away from a straight line in an interval, above which it is asked what
 # that costs: one that falls with a time constant of two intervals does, and pays 1e-3.
 STEEP = 0.15
+# Share of its magnitude within which a control does nothing.
+NOTHING = 1e-4
 
 
-def cost_of_form(extremal: Extremal, within: Within | None = None) -> float | None:
+def cost_of_form(extremal: Extremal, least: float, within: Within | None = None) -> float | None:
     """Estimated relative cost of the piecewise-linear form of controls that turn within few intervals.
 
     Of controls that are held constant over the intervals nothing is said: so is what holds them. Where a limit along
-    the path acts H_u is no measure; what the others cost is known all the same.
+    the path acts H_u is no measure; what the others cost is known all the same. What controls cost in which H is not
+    convex, as those that switch, is measured on a finer mesh.
 
     Args:
         extremal: the solution.
+        least: what is worth telling.
         within: what the rest of a chain says of it.
 
     Returns:
-        As `Optimality.control_error`, where no limit acts; None where the controls are smooth, or nothing is known.
+        As `Optimality.control_error`, where no limit acts; None where the controls are smooth, where it is no more than
+        the least, or where nothing is known.
     """
     st = extremal.statement
     if not st.nu or extremal.mesh.control != "linear" or not are_steep(extremal):
         return None
     from covocp.extremal.control_error import estimate_control_error, kinds_of
-    from covocp.extremal.cost_sizes import absolute_cost
+    from covocp.extremal.cost_sizes import ZERO_COST, absolute_cost
+    from covocp.extremal.finer_cost import change_on_finer_mesh
     from covocp.extremal.optimality import duality_gap
 
     kinds = kinds_of(extremal)
     at = acting_nodes(extremal)
     points = extremal.mesh.points
     held = np.add.reduceat(at[:-1] | at[1:], np.arange(0, at.size - 1, points)).astype(bool)[:, None]
-    others = 0.0 if within is None else within.size
-    size = max(absolute_cost(extremal) + others, duality_gap(extremal))
-    return estimate_control_error(extremal, (kinds.free & ~held, kinds.bounded & ~held), size)
+    size = max(absolute_cost(extremal) + (0.0 if within is None else within.size), duality_gap(extremal))
+    given = extremal, (kinds.free & ~held, kinds.bounded & ~held), size
+    found = estimate_control_error(*given) if size > ZERO_COST else None
+    if found is None or not found > least:
+        return None
+    sure = estimate_control_error(*given, convex_alone=True)
+    if sure is None or sure <= least:
+        found = change_on_finer_mesh(extremal, size, within)
+    return found if found is not None and found > least else None
 
 
 def are_steep(extremal: Extremal) -> bool:
@@ -49,10 +62,14 @@ def are_steep(extremal: Extremal) -> bool:
 
 
 def _turning(extremal: Extremal) -> Array:
-    """By how much each control leaves a straight line within an interval, at most, in its range."""
+    """By how much each control leaves a straight line within an interval, at most, in its range.
+
+    What hardly moves, in its magnitude, is rounding.
+    """
+    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
     u, h = extremal.controls, np.diff(extremal.time)
     long = h > 0.0  # what is read at an instant has an interval of no length, where controls jump
     slopes = np.diff(u, axis=0) / np.where(long, h, 1.0)[:, None]
     between = np.where(long[1:] & long[:-1], np.minimum(h[1:], h[:-1]), 0.0)
     turned = np.abs(np.diff(slopes, axis=0)) * between[:, None]
-    return np.asarray(turned.max(axis=0, initial=0.0) / np.maximum(np.ptp(u, axis=0), np.finfo(float).tiny))
+    return np.asarray(turned.max(axis=0, initial=0.0) / np.maximum(np.ptp(u, axis=0), NOTHING * units))

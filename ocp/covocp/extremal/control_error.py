@@ -76,7 +76,9 @@ def _beside(extremal: Extremal) -> Mask:
     return result
 
 
-def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: float) -> float | None:
+def estimate_control_error(
+    extremal: Extremal, kinds: tuple[Mask, Mask], size: float, *, convex_alone: bool = False
+) -> float | None:
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
@@ -90,6 +92,7 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: f
         extremal: the solution.
         kinds: of the controls in each interval, (N, nu): free in all of it; at a bound somewhere. Others do not count.
         size: of the cost, in which it is measured.
+        convex_alone: leave out those in which H is not convex, of which it is known to no more than ten times.
 
     Returns:
         The share of the cost; None where H is not known pointwise, and needed; nan where there is one control alone,
@@ -107,7 +110,7 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], size: f
     else:
         total = _by_points(extremal, along, convex, kinds, places)
         left = (kinds[0] | kinds[1]) & ~convex
-        if left.any():
+        if left.any() and not convex_alone:
             total += _above(extremal, left, around)
     return None if total is None else float(total / max(size, np.finfo(float).tiny))
 

@@ -160,7 +160,7 @@ def assess(
         control_slope = float(np.sqrt(np.mean(np.where(kinds.nodes, slope, 0.0) ** 2))) / scale
         control_error = estimate_control_error(extremal, (kinds.free, kinds.bounded), max(size, gap))
     found = Optimality(
-        stationarity=_stationarity(extremal, scale, within) if st.nu else 0.0,
+        stationarity=_stationarity(extremal, _left(extremal), scale, within) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
@@ -199,12 +199,17 @@ def stationarity_of(extremal: Extremal) -> float:
     if not extremal.statement.nu:
         return 0.0
     sizes = _at_nodes(extremal, discrete_costates(extremal)[0]).sizes
-    return _stationarity(extremal, max(float(sizes.max(initial=0.0)), np.finfo(float).tiny), None)
+    scale = max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)
+    return _stationarity(extremal, _left(extremal), scale, None)
 
 
-def _stationarity(extremal: Extremal, scale: float, within: Within | None) -> float:
+def _left(extremal: Extremal) -> Array:
+    """Slopes of the Lagrangian by the control values, all multipliers included."""
+    return discrete_costates(extremal)[1] + _limit_slopes(extremal) + extremal.multipliers.controls
+
+
+def _stationarity(extremal: Extremal, slopes: Array, scale: float, within: Within | None) -> float:
     """The largest slope of the Lagrangian per unit of time in units of the terms of H_u, or all of them in the cost."""
-    slopes = discrete_costates(extremal)[1] + _limit_slopes(extremal) + extremal.multipliers.controls
     shares = quadrature_weights(extremal.mesh)[:, None]
     times = np.maximum(shares, shares.mean()) * extremal.trajectory.duration  # what acts for less time is not seen
     value = float((np.abs(slopes) / times).max(initial=0.0)) / scale

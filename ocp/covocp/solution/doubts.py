@@ -94,10 +94,10 @@ def mention_form(extremal: Extremal, within: Within | None = None, remedy: str =
     """
     try:
         with np.errstate(all="ignore"):
-            paid = cost_of_form(extremal, within)
+            paid = cost_of_form(extremal, COARSE_CONTROLS, within)
     except (CovocpError, RuntimeError, ArithmeticError, ValueError):  # the report says that it is not known
         return
-    if paid is None or not paid > COARSE_CONTROLS:
+    if paid is None:
         return
     much = f"about {paid:.1e} of the cost" if paid < FAR_OFF else "much of the cost, or a multiple of it"
     warn_user(
