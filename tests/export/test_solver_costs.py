@@ -135,9 +135,8 @@ def test_steps_that_have_c_code_are_exact_in_any_units():
     np.testing.assert_allclose(found, exact, rtol=1e-13)
 
 
-@pytest.mark.parametrize("start", [{}, {"initial_x": 1.5}, {"initial_x": -1.5}, {"initial_x": 1.0}])
 @pytest.mark.parametrize("method", ["sqpmethod", "ipopt"])
-def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimum(method, start):
+def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimum(method):
     """Its cost is two, its curvature in units of the variables two thousand: the first slopes led astray.
 
     From other starts the approximate Hessian of `sqpmethod` may creep: what it then leaves is not called OK.
@@ -152,9 +151,9 @@ def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimu
         ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
         return ocp
 
-    folder = FOLDER / f"prior_{method}_{sum(start.values())}"
-    planner = export_c(make(), folder, intervals=20, method=method).reference()
-    plan = planner(**start)
-    right = float(plan["cost"]) == pytest.approx(optimum(moved(make(), start), plan), rel=SAME)
-    assert planner.status == ("OK" if right else "NOT_CONVERGED")
-    assert right or (start and method == "sqpmethod")
+    planner = export_c(make(), FOLDER / f"prior_{method}", intervals=20, method=method).reference()
+    for start in ({}, {"initial_x": 1.5}, {"initial_x": -1.5}, {"initial_x": 1.0}):
+        plan = planner(**start)
+        right = float(plan["cost"]) == pytest.approx(optimum(moved(make(), start), plan), rel=SAME)
+        assert planner.status == ("OK" if right else "NOT_CONVERGED"), start
+        assert right or (start and method == "sqpmethod"), start
