@@ -251,10 +251,8 @@ class Solver(ClassicalRuns):
                     if assess:
                         outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:
-                    best, own = self._best, self._problem
-                    started = partial(
-                        gain_first, best, own, self._solved, parameters or {}, allow_failure=allow_failure
-                    )
+                    known = self._best, self._problem, self._solved, parameters or {}
+                    started = partial(gain_first, *known, allow_failure=allow_failure)
                     outcome, first = self._from_given(values, started, guess, reporter, assess=assess)
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
@@ -270,7 +268,7 @@ class Solver(ClassicalRuns):
                 return self._timed(self._finish(outcome, first, allow_failure=True, assess=assess), begin)
             outcome = with_stalled(outcome, reporter)
             solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
-            if assess and nominal is not outcome and nominal.converged and solution.converged:
+            if assess and self.nominal == "deterministic" and nominal.converged and solution.converged:
                 mention_form(nominal.extremal, remedy="Use more intervals.")
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 
