@@ -251,8 +251,8 @@ class Solver(ClassicalRuns):
                     if assess:
                         outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:
-                    known: Any = (self._best, self._problem, self._solved, parameters or {})
-                    started = partial(gain_first, *known, allow_failure=allow_failure)
+                    about: Any = (self._best, self._problem, self._solved, parameters or {})
+                    started = partial(gain_first, *about, allow_failure=allow_failure)
                     outcome, first = self._from_given(values, started, guess, reporter, assess=assess)
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
