@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.links import Within
 from covocp.extremal.path_limits import acting_nodes
@@ -57,19 +56,15 @@ def cost_of_form(extremal: Extremal, least: float, within: Within | None = None)
 
 
 def are_steep(extremal: Extremal) -> bool:
-    """Whether a control leaves a straight line within an interval by much of its range."""
-    return bool((_turning(extremal) > STEEP).any())
-
-
-def _turning(extremal: Extremal) -> Array:
-    """By how much each control leaves a straight line within an interval, at most, in its range.
-
-    What hardly moves, in its magnitude, is rounding.
-    """
-    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
+    """Whether a control leaves a straight line within an interval by much of its range; what hardly moves does not."""
     u, h = extremal.controls, np.diff(extremal.time)
     long = h > 0.0  # what is read at an instant has an interval of no length, where controls jump
     slopes = np.diff(u, axis=0) / np.where(long, h, 1.0)[:, None]
     between = np.where(long[1:] & long[:-1], np.minimum(h[1:], h[:-1]), 0.0)
-    turned = np.abs(np.diff(slopes, axis=0)) * between[:, None]
-    return np.asarray(turned.max(axis=0, initial=0.0) / np.maximum(np.ptp(u, axis=0), NOTHING * units))
+    turned = (np.abs(np.diff(slopes, axis=0)) * between[:, None]).max(axis=0, initial=0.0)
+    span = np.ptp(u, axis=0)
+    steep = turned > STEEP * span
+    if not steep.any():
+        return False
+    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
+    return bool((steep & (span > NOTHING * units)).any())
