@@ -42,6 +42,7 @@ class ClassicalRuns:
     _classical: ClassicalDesign
     _own_steps: bool
     _patient: dict[str, Any]
+    _at_once: bool
     _asked_for: bool
     _last: tuple[Array, Outcome] | None
 
@@ -71,10 +72,12 @@ class ClassicalRuns:
 
     def _at_classical(self, values: Array, reporter: Progress) -> Outcome | None:
         """The nominal of the deterministic cost where it is the optimum for certain; None where a run must tell."""
+        self._at_once = False
         if not self._patient or reporter.stop:
             return None
         found = at_classical(self.statement, self._prepared.mesh, self._classical.nominal(values), values)
-        return None if reporter.stop else found
+        self._at_once = found is not None and not reporter.stop
+        return found if self._at_once else None
 
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
         """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
@@ -116,11 +119,26 @@ class ClassicalRuns:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
             finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
-            again = None if finer is None else self._again_by(finer, outcome, values, reporter)
+            if finer is None:
+                break
+            again = self._at_once_by(finer, outcome, values, reporter)
+            again = self._again_by(finer, outcome, values, reporter) if again is None else again
             if again is None:
                 break
             outcome = again
         return outcome
+
+    def _at_once_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
+        """What was found from the deterministic cost at once, by shorter steps; None where a run must tell."""
+        if not self._at_once:
+            return None
+        before = self._options, self._prepared
+        self._keep(finer, self._ready(finer))
+        again = self._at_classical(values, reporter)
+        if again is None:
+            self._keep(*before)
+            return None
+        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
 
     def _again_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
         """An outcome by shorter steps, which later runs take then; None where that fails."""

@@ -19,8 +19,7 @@ from covocp.base.residuals import LIMIT
 from covocp.extremal.coarse_controls import are_steep
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls
-from covocp.extremal.mesh_error import COARSE_MESH
-from covocp.solution.solution import Solution
+from covocp.extremal.mesh_error import COARSE_MESH, mesh_error
 from covocp.solving.attempts import counted, from_starts, with_stats
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.separation import quadratic, separates
@@ -130,13 +129,14 @@ def _is_stationary(outcome: Outcome) -> bool:
     The optimum of a quadratic program is so by either sum, and no other point is better by more than these differ: a
     slope counts by its square. Where controls turn between two nodes the sums have little in common.
     """
-    solution = Solution.of(outcome, "ipopt")
-    left = max(LIMIT, min(solution.mesh_error, COARSE_MESH))
-    if impatient(outcome.extremal.statement):
-        left = max(left, float(np.sqrt(solution.mesh_error)), UNRESOLVED if are_steep(outcome.extremal) else 0.0)
+    extremal = outcome.extremal
+    error = mesh_error(extremal, outcome.cost_terms["running"])
+    left = max(LIMIT, min(error, COARSE_MESH))
+    if impatient(extremal.statement):
+        left = max(left, float(np.sqrt(error)), UNRESOLVED if are_steep(extremal) else 0.0)
     from covocp.extremal.optimality import stationarity_of
 
-    return stationarity_of(outcome.extremal) <= left
+    return stationarity_of(extremal) <= left
 
 
 def _multipliers(statement: Statement, mesh: Mesh, found: Outcome) -> Multipliers | None:

@@ -125,7 +125,7 @@ class Solver(ClassicalRuns):
         self._options = self._laid_out()
         self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
-        self._looked = self._ran = False  # at the steps along the guess; from a start
+        self._looked = self._ran = self._at_once = False  # at the steps along the guess; from a start; without a run
         self._last: tuple[Array, Outcome] | None = None  # values, and what came of them by itself
         self._borne: Beginning | None = None  # what the nodes are known to be graded for
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
@@ -291,7 +291,7 @@ class Solver(ClassicalRuns):
                 self._look_at_steps(values)
             if (optimum := self._at_classical(values, reporter)) is not None:
                 return optimum, None
-        found = None
+        self._at_once, found = False, None
         if isinstance(guess, Solution):
             own = first is guess
             further = own and self._by_ipopt
