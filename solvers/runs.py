@@ -480,7 +480,7 @@ class Runs:
 
 def _numbers(value: Any) -> Array:
     """What a solver gives, a matrix of CasADi's or an array, as numbers one after the other."""
-    return np.asarray(as_array(value), dtype=float).ravel()
+    return as_array(value).ravel().astype(float, copy=False)
 
 
 def share_for(times: float) -> float:

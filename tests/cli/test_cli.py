@@ -338,7 +338,7 @@ def test_warnings_are_lines(capsys):
     assert code == 0
     lines = err.splitlines()
     assert lines[0].startswith("covocp: warning: The mesh is too coarse")
-    assert lines[1].startswith("covocp: warning: The controls turn faster")
+    assert lines[1].startswith("covocp: warning: The controls change faster")
     assert len(lines) == 2
 
 

@@ -164,7 +164,7 @@ def short_pulse() -> tuple[co.Problem, float]:
     return ocp, -0.5 * (0.03**2 + 0.97**2)
 
 
-@pytest.mark.filterwarnings("ignore:The controls turn faster")  # with a valve on 13 intervals by 1.3e-2
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # with a valve on 13 intervals by 1.3e-2
 @pytest.mark.parametrize("control", ["constant", "linear"])
 @pytest.mark.parametrize(
     ("problem", "intervals", "most"),

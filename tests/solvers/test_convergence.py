@@ -143,7 +143,7 @@ def test_a_limit_on_a_state_beside_a_large_penalty() -> None:
     assert found.optimality.complementarity < 1e-5
 
 
-@pytest.mark.filterwarnings("ignore:The controls turn faster")  # 20 intervals of a jump
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # 20 intervals of a jump
 def test_what_no_run_makes_less_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
     with pytest.warns(co.CovocpWarning, match="The cost may be above the least one") as told:
@@ -165,7 +165,7 @@ def halves() -> co.Phases:
     return co.Phases(parts)
 
 
-@pytest.mark.filterwarnings("ignore:The controls turn faster")  # 20 intervals of a jump
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # 20 intervals of a jump
 def test_phases_hide_nothing_either_and_tell_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert co.solve(halves(), intervals=10, progress=False).cost == pytest.approx(1 / (1 + 1e-8), rel=1e-6)
     monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)

@@ -397,7 +397,7 @@ def test_a_condition_on_a_control_is_about_one_side(side: Any, control: str) -> 
     assert gradient.multiplier("at two") == pytest.approx(found.multiplier("at two"), rel=2e-3)
 
 
-@pytest.mark.filterwarnings("ignore:The controls turn faster")  # few intervals
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # few intervals
 def test_limits_inside_the_intervals_go_with_conditions_at_instants() -> None:
     ocp, x, v, u = errand(4.0)
     ocp.subject_to(v**2 + 0.1 * x, upper=0.9, name="slow")
@@ -515,7 +515,7 @@ def test_evaluation_says_what_is_missed() -> None:
     assert not along.violations
 
 
-@pytest.mark.filterwarnings("ignore:The controls turn faster")  # few intervals
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # few intervals
 def test_the_printout_has_values_and_multipliers() -> None:
     text = str(co.solve(through(), intervals=10, progress=False))
     assert "condition at an instant" in text

@@ -1,4 +1,4 @@
-"""Controls that turn faster than the nodes can say, and what their piecewise-linear form costs then."""
+"""Controls that change faster than the nodes can say, and what their piecewise-linear form costs then."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ def cost_of_form(extremal: Extremal, least: float, within: Within | None = None)
     """Estimated relative cost of the piecewise-linear form of controls that turn within few intervals.
 
     Of controls that are held constant over the intervals nothing is said: so is what holds them. Where a limit along
-    the path acts H_u is no measure; what the others cost is known all the same. What controls cost in which H is not
-    convex, as those that switch, is measured on a finer mesh.
+    the path acts H_u is no measure; what the others cost is known all the same. What is worth telling by H_u is
+    measured on a finer mesh: a large estimate is crude, and so is one of controls in which H is not convex, as of those
+    that switch. Beside matrices that takes long, and these controls alone are measured.
 
     Args:
         extremal: the solution.
@@ -40,19 +41,19 @@ def cost_of_form(extremal: Extremal, least: float, within: Within | None = None)
     from covocp.extremal.finer_cost import change_on_finer_mesh
     from covocp.extremal.optimality import duality_gap
 
-    kinds = kinds_of(extremal)
-    at = acting_nodes(extremal)
-    points = extremal.mesh.points
-    held = np.add.reduceat(at[:-1] | at[1:], np.arange(0, at.size - 1, points)).astype(bool)[:, None]
+    kinds, at = kinds_of(extremal), acting_nodes(extremal)
+    held = (at[:-1] | at[1:]).reshape(extremal.mesh.intervals, -1).any(axis=1, keepdims=True)  # by a limit
     size = max(absolute_cost(extremal) + (0.0 if within is None else within.size), duality_gap(extremal))
     given = extremal, (kinds.free & ~held, kinds.bounded & ~held), size
     found = estimate_control_error(*given) if size > ZERO_COST else None
     if found is None or not found > least:
         return None
-    sure = estimate_control_error(*given, convex_alone=True)
-    if sure is None or sure <= least:
-        found = change_on_finer_mesh(extremal, size, within)
-    return found if found is not None and found > least else None
+    convex = estimate_control_error(*given, convex_alone=True)
+    sure = found if convex is not None and convex > least else None
+    if st.ne and sure is not None:
+        return sure
+    measured = change_on_finer_mesh(extremal, size, within)
+    return sure if measured is None else measured if measured > least else None
 
 
 def are_steep(extremal: Extremal) -> bool:

@@ -95,7 +95,7 @@ def acting(extremal: Extremal) -> dict[str, float]:
     steps = np.diff(refined(extremal).mesh.nodes)
     shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
     found: dict[str, float] = {}
-    for name, at in _near(extremal):
+    for name, at in _at_limits(extremal):
         if at.any():
             found[name] = max(float(shares @ at), found.get(name, 0.0))
     return found
@@ -104,12 +104,12 @@ def acting(extremal: Extremal) -> dict[str, float]:
 def acting_nodes(extremal: Extremal) -> NDArray[np.bool_]:
     """Points of the mesh at which limits are imposed, and one of them acts."""
     result = np.zeros(extremal.mesh.intervals * extremal.mesh.points + 1, dtype=bool)
-    for _, at in _near(extremal) if limited(extremal) else ():
+    for _, at in _at_limits(extremal) if limited(extremal) else ():
         result |= at
     return result
 
 
-def _near(extremal: Extremal) -> list[tuple[str, NDArray[np.bool_]]]:
+def _at_limits(extremal: Extremal) -> list[tuple[str, NDArray[np.bool_]]]:
     """Each state with bounds and each condition along the path, and at which points it is at a limit."""
     extremal = refined(extremal)  # limits act at all its nodes
     st, bounded = extremal.statement, extremal.statement.bounded_states

@@ -84,12 +84,15 @@ def mention_doubts(solution: Solution) -> None:
         )
 
 
-def mention_form(extremal: Extremal, within: Within | None = None, remedy: str = REFINE) -> None:
-    """Warn of controls that turn faster than their nodes can say, where that costs much.
+def mention_form(
+    extremal: Extremal, within: Within | None = None, cost: str = "the cost", remedy: str = REFINE
+) -> None:
+    """Warn of controls that change faster than their nodes can say, where that costs much.
 
     Args:
         extremal: the solution.
         within: what the rest of a chain says of it.
+        cost: which it is.
         remedy: what helps, a sentence.
     """
     try:
@@ -99,10 +102,9 @@ def mention_form(extremal: Extremal, within: Within | None = None, remedy: str =
         return
     if paid is None:
         return
-    much = f"about {paid:.1e} of the cost" if paid < FAR_OFF else "much of the cost, or a multiple of it"
+    much = f"about {paid:.1e} of {cost}" if paid < FAR_OFF else f"much of {cost}, by a crude estimate"
     warn_user(
-        "The controls turn faster than the mesh lets them: that they are linear between its nodes costs "
-        f"{much} (optimality.control_error). {remedy}"
+        f"The controls change faster than the mesh resolves: being linear between its nodes costs {much}. {remedy}"
     )
 
 

@@ -11,6 +11,7 @@ from covocp.base.pages import Section, Sentence, Table
 from covocp.extremal.path_limits import acting
 from covocp.solution.jumps import jumps_of
 from covocp.solution.origin import Origin
+from covocp.statement.separation import quadratic, separates
 
 if TYPE_CHECKING:
     from covocp.solution.solution import Solution
@@ -38,6 +39,8 @@ RESIDUALS = {
 UNCHECKED = "not checked: explicit steps back would be too many; costates near the end may be off"
 # Of nodes and costs that are no run along the controls.
 STEPS = "LARGE: the integration steps are too long, or an unstable plant amplifies them: more intervals or substeps"
+# Of the optimum of a quadratic program.
+OTHER_SUM = "large: on so coarse a mesh, as the cost is summed up otherwise than where this is optimal: more intervals"
 # Where to begin to worry about a residual, and what a large one means.
 WORRIES: dict[str, tuple[float, str]] = {
     "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
@@ -111,6 +114,9 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     level, words = WORRIES.get(name, (np.inf, ""))
     if name == "control_error" and solution.mesh.control == "constant":
         words += ", or control='linear'"
+    statement = solution.statement
+    if name == "stationarity" and statement is not None and separates(statement) and quadratic(statement):
+        words = OTHER_SUM
     return words if solution.converged and abs(value) > level else ""
 
 

@@ -67,15 +67,25 @@ class ClassicalRuns:
         if self.nominal != "combined" or not self.statement.behind or self._asked_for:
             return failed, prepared
         ready, nominal = partial(self._ready, self._options, **self._patient), partial(self._classical.nominal, values)
+        if (told := self._at_classical(values, reporter, strict=False)) is not None:
+            return with_stats(told, **{**failed.stats, **told.stats, **counted(failed, told)}), prepared
         outcome, prepared = from_classical(failed, prepared, ready, nominal, values, reporter)
         return patiently(outcome, prepared, ready, values, reporter) if self._patient else (outcome, prepared)
 
-    def _at_classical(self, values: Array, reporter: Progress) -> Outcome | None:
-        """The nominal of the deterministic cost where it is the optimum for certain; None where a run must tell."""
+    def _at_classical(self, values: Array, reporter: Progress, *, strict: bool = True) -> Outcome | None:
+        """The nominal of the deterministic cost where it is the optimum for certain; None where a run must tell.
+
+        A run must where it is limited: that one knows no limits.
+        """
         self._at_once = False
-        if not self._patient or reporter.stop:
+        if not self._patient or reporter.limited or reporter.stop:
             return None
-        found = at_classical(self.statement, self._prepared.mesh, self._classical.nominal(values), values)
+        try:
+            nominal = self._classical.nominal(values)
+        except KeyboardInterrupt:  # the run, which ends as soon as it begins, has an iterate to carry
+            reporter.asked = True
+            return None
+        found = at_classical(self.statement, self._prepared.mesh, nominal, values, strict=strict)
         self._at_once = found is not None and not reporter.stop
         return found if self._at_once else None
 
@@ -134,7 +144,7 @@ class ClassicalRuns:
             return None
         before = self._options, self._prepared
         self._keep(finer, self._ready(finer))
-        again = self._at_classical(values, reporter)
+        again = self._at_classical(values, reporter, strict=False)
         if again is None:
             self._keep(*before)
             return None

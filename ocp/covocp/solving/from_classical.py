@@ -31,6 +31,10 @@ from covocp.transcription.trajectory import Multipliers
 SOON = 100
 # Stationarity up to which slopes of controls that turn between two nodes are those of the sum on so few of them.
 UNRESOLVED = 0.5
+# Stationarity of a quadratic cost that is above the least one by a share of 1e-6 or less.
+LITTLE = 5e-4
+# Complementarity, relative to the cost, up to which bounds of controls are met as exactly as by a run.
+EXACT = 1e-7
 # Multipliers that both problems have; those of the matrices are the problem's own.
 SHARED = ("final", "end", "start", "instants", "path", "states", "controls", "inside_path", "inside_states")
 
@@ -65,7 +69,7 @@ def from_classical(
     around = None if found is None or reporter.stop else _around(statement, prepared.mesh, found, values)
     if found is None or around is None:
         return failed, prepared
-    if (told := _as_optimum(around, found)) is not None:
+    if (told := _as_optimum(around, found, strict=False)) is not None:
         return with_stats(told, **{**failed.stats, **found.stats, **counted(failed, found)}), prepared
     try:
         again = ready()
@@ -76,7 +80,9 @@ def from_classical(
     return (with_stats(outcome, **counts), again) if outcome.converged else (with_stats(failed, **counts), prepared)
 
 
-def at_classical(statement: Statement, mesh: Mesh, found: Outcome | None, values: Array) -> Outcome | None:
+def at_classical(
+    statement: Statement, mesh: Mesh, found: Outcome | None, values: Array, *, strict: bool
+) -> Outcome | None:
     """The optimum of the expected cost where that is the one of a quadratic program; None where it is not had so.
 
     Args:
@@ -84,10 +90,13 @@ def at_classical(statement: Statement, mesh: Mesh, found: Outcome | None, values
         mesh: of the combined design.
         found: the outcome of the deterministic problem; None where there is none.
         values: of the parameters.
+        strict: by the sums of the expected cost as exactly as a run would have it.
     """
-    around = None if found is None or not mesh.eliminated else _around(statement, mesh, found, values)
-    told = None if found is None or around is None else _as_optimum(around, found)
-    return None if found is None or told is None else with_stats(told, **found.stats)
+    if found is None or not mesh.eliminated:
+        return None
+    around = _around(statement, mesh, found, values)
+    told = None if around is None else _as_optimum(around, found, strict=strict)
+    return None if told is None else with_stats(told, **found.stats)
 
 
 def _around(statement: Statement, mesh: Mesh, found: Outcome, values: Array) -> Outcome | None:
@@ -100,7 +109,7 @@ def _around(statement: Statement, mesh: Mesh, found: Outcome, values: Array) -> 
     return around if around.converged else None
 
 
-def _as_optimum(around: Outcome, found: Outcome) -> Outcome | None:
+def _as_optimum(around: Outcome, found: Outcome, *, strict: bool) -> Outcome | None:
     """What runs around the nominal as the optimum of the expected cost, where it is stationary."""
     statement, mesh = around.extremal.statement, around.extremal.mesh
     own = _multipliers(statement, mesh, found) if separates(statement) else None
@@ -108,7 +117,7 @@ def _as_optimum(around: Outcome, found: Outcome) -> Outcome | None:
         return None
     extremal = replace(around.extremal, multipliers=own)
     told = replace(around, extremal=extremal, message=found.message, violations=found.violations)
-    return told if _is_stationary(told) else None
+    return told if _is_stationary(told, strict) else None
 
 
 def patiently(
@@ -123,19 +132,23 @@ def patiently(
     return with_stats(outcome, **counted(failed, outcome)), prepared
 
 
-def _is_stationary(outcome: Outcome) -> bool:
+def _is_stationary(outcome: Outcome, strict: bool) -> bool:
     """Whether the expected cost is stationary there, too, up to what its steps leave: it is summed up otherwise.
 
-    The optimum of a quadratic program is so by either sum, and no other point is better by more than these differ: a
-    slope counts by its square. Where controls turn between two nodes the sums have little in common.
+    Where no run has come to an end the optimum of a quadratic program counts by its own sum. The cost is quadratic in
+    what is left of the slope: above the least one by about the error of the mesh, where the slope is below its root.
+    Where controls turn between two nodes both sums have little in common. Either is told.
     """
+    from covocp.extremal.optimality import complementarity, stationarity_of  # which few solves need
+
     extremal = outcome.extremal
     error = mesh_error(extremal, outcome.cost_terms["running"])
     left = max(LIMIT, min(error, COARSE_MESH))
+    if strict:
+        left = max(LIMIT, min(float(np.sqrt(error)), LITTLE))
+        return stationarity_of(extremal) <= left and complementarity(extremal) <= EXACT
     if impatient(extremal.statement):
         left = max(left, float(np.sqrt(error)), UNRESOLVED if are_steep(extremal) else 0.0)
-    from covocp.extremal.optimality import stationarity_of
-
     return stationarity_of(extremal) <= left
 
 

@@ -269,7 +269,7 @@ class Solver(ClassicalRuns):
             outcome = with_stalled(outcome, reporter)
             solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
             if assess and self.nominal == "deterministic" and nominal.converged and solution.converged:
-                mention_form(nominal.extremal, remedy="Use more intervals.")
+                mention_form(nominal.extremal, cost="the cost without noise", remedy="Use more intervals.")
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 
     def _timed(self, solution: Solution, begin: float) -> Solution:
