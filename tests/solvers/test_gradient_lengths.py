@@ -41,7 +41,7 @@ def solved(ocp, a, substeps=1, **options):
     return solver.solve({"a": a}, progress=False)
 
 
-@pytest.mark.filterwarnings("ignore:The controls change faster")  # as they do
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval
 @pytest.mark.parametrize("a", [40.0, 50.0])
 @pytest.mark.filterwarnings("ignore:The mesh is too coarse")
 def test_costates_take_the_steps_that_faster_values_need(a):
@@ -51,7 +51,7 @@ def test_costates_take_the_steps_that_faster_values_need(a):
     assert abs(solution.cost - energy(a)) <= 2.5 * solution.optimality.mesh_error * solution.cost
 
 
-@pytest.mark.filterwarnings("ignore:The controls change faster")  # as they do
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval
 def test_short_steps_reach_the_least_energy():
     solution = solved(decaying(), 40.0, substeps=8)
     assert solution.cost == pytest.approx(energy(40.0), rel=1e-3)
@@ -77,7 +77,7 @@ def test_a_condition_that_bounds_forbid_keeps_its_reason():
         solved(decaying(bound=0.01), 2.0)
 
 
-@pytest.mark.filterwarnings("ignore:The controls change faster")  # as they do
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval
 @pytest.mark.parametrize("substeps", ["auto", 1])
 def test_costates_that_no_explicit_steps_follow_are_the_reason(substeps):
     with pytest.raises(co.SolveError, match="the costates are too fast") as caught:
@@ -103,7 +103,7 @@ def test_a_covariance_that_given_steps_blow_up():
     assert fine.cost == pytest.approx(1.0 + 1.0 / (1.0 + 1e3), rel=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore:The controls change faster")  # as they do
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval
 def test_phases_take_the_steps_of_their_values():
     first, second = decaying(final=None, name="one"), co.Problem(duration=1.0, name="two")
     a = second.parameter("a", 1.0)

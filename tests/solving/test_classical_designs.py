@@ -130,7 +130,7 @@ def test_iterations_that_were_asked_for_are_not_exceeded():
     assert found.stats["iterations"] <= 2
 
 
-@pytest.mark.filterwarnings("ignore:The controls change faster")  # as they do
+@pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval
 def test_a_stable_plant_is_not_held_at_the_nodes_of_long_steps():
     """Other steps leave these as well, which is no instability; by shorter ones the cost is that of the controls."""
     ocp = co.Problem(20.0)
