@@ -12,6 +12,8 @@ from covocp.transcription.scales import choose_scales
 # Share of its range by which a control turns away from a straight line in an interval, above which it is asked what
 # that costs: one that falls with a time constant of two intervals does, and pays 1e-3.
 STEEP = 0.15
+# Entries of the matrices above which it is not asked: the answer takes as much memory as the solution, beside it.
+MOST_ENTRIES = 2000
 # Share of its magnitude within which a control does nothing.
 NOTHING = 1e-4
 
@@ -31,10 +33,10 @@ def cost_of_form(extremal: Extremal, least: float, within: Within | None = None)
 
     Returns:
         As `Optimality.control_error`, where no limit acts; None where the controls are smooth, where it is no more than
-        the least, or where nothing is known.
+        the least, or where nothing is known, as beside matrices of more than 2000 entries.
     """
     st = extremal.statement
-    if not st.nu or extremal.mesh.control != "linear" or not are_steep(extremal):
+    if not st.nu or st.ne > MOST_ENTRIES or extremal.mesh.control != "linear" or not are_steep(extremal):
         return None
     from covocp.extremal.control_error import estimate_control_error, kinds_of
     from covocp.extremal.cost_sizes import ZERO_COST, absolute_cost
