@@ -10,8 +10,8 @@ from covocp.extremal.path_limits import acting_nodes
 from covocp.transcription.scales import choose_scales
 
 # Share of its range by which a control turns away from a straight line in an interval, above which it is asked what
-# that costs: one that falls with a time constant of two intervals does, and pays 1e-3.
-STEEP = 0.15
+# that costs: one that falls with a time constant of one and a half intervals does, and pays 2e-4.
+STEEP = 0.25
 # Entries of the matrices above which it is not asked: the answer takes as much memory as the solution, beside it.
 MOST_ENTRIES = 2000
 # Share of its magnitude within which a control does nothing.
