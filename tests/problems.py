@@ -90,3 +90,21 @@ def simulate(rate, start, t, u):
 
         z.append(solve_ivp(slope, (t[i], t[i + 1]), z[-1], **TIGHT).y[:, -1])
     return np.array(z)
+
+
+def least_fuel() -> tuple[co.Problem, float]:
+    """Two thrusters, each on for t with t (3 - t) = 1."""
+    ocp = co.Problem(3.0)
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    ahead, back = ocp.control("ahead", lower=0.0, upper=1.0), ocp.control("back", lower=0.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, ahead - back)
+    ocp.minimize(running=ahead + back)
+    return ocp, 3.0 - float(np.sqrt(5.0))
+
+
+def beside_switches(off: float, ramp: float) -> np.ndarray:
+    """A grid for `least_fuel` whose ramps in place of its switches are too late, and early, by a share of the time."""
+    begin = least_fuel()[1] / 6.0 + off
+    end = begin + ramp
+    return np.array([0.0, begin, end, 0.35, 0.5, 0.65, 1.0 - end, 1.0 - begin, 1.0])

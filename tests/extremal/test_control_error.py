@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from problems import least_fuel
 from scipy.linalg import expm
 
 import covocp as co
@@ -131,17 +132,6 @@ def least_time() -> tuple[co.Problem, float]:
     ocp.dynamics(v, u)
     ocp.minimize(terminal=ocp.duration)
     return ocp, float(np.sqrt(3.0))
-
-
-def least_fuel() -> tuple[co.Problem, float]:
-    """Two thrusters, each on for t with t (3 - t) = 1."""
-    ocp = co.Problem(3.0)
-    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
-    ahead, back = ocp.control("ahead", lower=0.0, upper=1.0), ocp.control("back", lower=0.0, upper=1.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, ahead - back)
-    ocp.minimize(running=ahead + back)
-    return ocp, 3.0 - float(np.sqrt(5.0))
 
 
 def singular_arc() -> tuple[co.Problem, float]:

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from problems import beside_switches, least_fuel
 from scipy.linalg import solve_continuous_are
 
 import covocp as co
@@ -84,16 +85,8 @@ def test_a_solver_of_another_duration_and_phases_tell_it_too():
 
 def test_switches_that_cost_little_are_measured():
     """Least fuel on 8 intervals: by H it would be 1.7e-2, it is 8e-4."""
-    ocp = co.Problem(3.0)
-    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
-    a, b = ocp.control("a", lower=0.0, upper=1.0), ocp.control("b", lower=0.0, upper=1.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, a - b)
-    ocp.minimize(running=a + b)
-    optimum = 3.0 - np.sqrt(5.0)  # thrust over half of it, coast, brake
-    begin, end = optimum / 6.0 + 1e-3, optimum / 6.0 + 1.1e-3
-    grid = [0.0, begin, end, 0.35, 0.5, 0.65, 1.0 - end, 1.0 - begin, 1.0]
-    cost, words = told(lambda: co.solve(ocp, grid=grid, progress=False))
+    ocp, optimum = least_fuel()
+    cost, words = told(lambda: co.solve(ocp, grid=beside_switches(1e-3, 1e-4), progress=False))
     assert cost == pytest.approx(optimum, rel=1e-3)
     assert not words
 

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from problems import beside_switches, least_fuel
 from scipy.integrate import quad
 
 import covocp as co
@@ -240,15 +241,7 @@ def test_all_meshes_have_the_units_of_the_first_solution(monkeypatch):
 @pytest.mark.parametrize(("off", "ramp"), [(3e-4, 1e-4), (1e-3, 1e-4), (1e-3, 1e-5), (1e-4, 1e-5)])
 def test_jumps_that_are_not_where_they_should_be_are_seen(off, ramp):
     """Half of the error was seen: meshes that only divide intervals do not move a jump that has nodes beside it."""
-    ocp = co.Problem(3.0)
-    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
-    a, b = ocp.control("a", lower=0.0, upper=1.0), ocp.control("b", lower=0.0, upper=1.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, a - b)
-    ocp.minimize(running=a + b)
-    optimum = 3.0 - np.sqrt(5.0)  # thrust over half of it, coast, brake
-    begin, end = optimum / 6.0 + off, optimum / 6.0 + off + ramp
-    grid = np.array([0.0, begin, end, 0.35, 0.5, 0.65, 1.0 - end, 1.0 - begin, 1.0])
+    (ocp, optimum), grid = least_fuel(), beside_switches(off, ramp)
     truth = co.solve(ocp, grid=grid, progress=False).cost / optimum - 1.0
     errors = co.solve(ocp, grid=grid, refine=1e-6, progress=False).stats["mesh_errors"]
     assert truth > 0.8 * off

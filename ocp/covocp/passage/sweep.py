@@ -46,7 +46,8 @@ class Told:
 class Entries:
     """h H of Gauss steps by what may be nonzero in it.
 
-    size: n of the covariance. pattern: rows and columns of the entries. first, second: at both points, a column a step.
+    size: n of the covariance. pattern: rows and columns of the entries in H, (2n, 2n). first, second: the entries at
+    both Gauss points, (entries, steps).
     """
 
     size: int

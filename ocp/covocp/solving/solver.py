@@ -251,13 +251,13 @@ class Solver(ClassicalRuns):
                     if assess:
                         outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:
-                    about: Any = (self._best, self._problem, self._solved, parameters or {})
-                    started = partial(gain_first, *about, allow_failure=allow_failure)
+                    own, given = self._problem, parameters or {}
+                    started = partial(gain_first, self._best, own, self._solved, given, allow_failure=allow_failure)
                     outcome, first = self._from_given(values, started, guess, reporter, assess=assess)
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
-                nominal = outcome
+                without_noise = outcome
                 if self.nominal == "deterministic":
                     outcome = self._closed(outcome, values, reporter)
             if reporter.asked:
@@ -268,8 +268,8 @@ class Solver(ClassicalRuns):
                 return self._timed(self._finish(outcome, first, allow_failure=True, assess=assess), begin)
             outcome = with_stalled(outcome, reporter)
             solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
-            if assess and self.nominal == "deterministic" and nominal.converged and solution.converged:
-                mention_form(nominal.extremal, cost="the cost without noise", remedy="Use more intervals.")
+            if assess and self.nominal == "deterministic" and without_noise.converged and solution.converged:
+                mention_form(without_noise.extremal, cost="the cost without noise", remedy="Use more intervals.")
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 
     def _timed(self, solution: Solution, begin: float) -> Solution:
@@ -290,7 +290,7 @@ class Solver(ClassicalRuns):
             if assess:
                 self._look_at_steps(values)
             if (optimum := self._at_classical(values, reporter)) is not None:
-                return optimum, None
+                return away_from_saddle(self._prepared, optimum, values, reporter, None) if assess else optimum, None
         self._at_once, found = False, None
         if isinstance(guess, Solution):
             own = first is guess
