@@ -86,7 +86,7 @@ class Worth:
             statement = self.classical.statement
             if statement is not None and separates(statement):
                 return "nothing to gain: nominal and statistics separate; the classical design will do"
-            return "nothing to gain along this nominal, which hardly moves the statistics; the classical design will do"
+            return "nothing to gain: this nominal hardly moves the statistics; the classical design will do"
         return "little to gain: the classical design is nearly as good"
 
     def __str__(self) -> str:
