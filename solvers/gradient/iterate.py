@@ -280,14 +280,15 @@ class Space(Unknowns):
         total, lower, upper = np.zeros(iterate.point.size), *self.room(iterate)
         present, ell, target = linear, np.zeros(self.conditions), -iterate.run.miss
         step = None
-        u = iterate.run.u
+        u, rows = iterate.run.u, linear.rows.copy()
         for _ in range(CHORD_STEPS):
             metric = learnt(self.metric_along(iterate, u, linear, ell, "curvature"), ())
             slope = present.slope.copy()
             slope[self.controls :] = linear.slope[self.controls :] + self.extra * total[self.controls :]
-            step = solve_step(metric, slope, present.rows, target, lower - total, upper - total, active)
+            rows[:, : self.controls] = present.rows[:, : self.controls]
+            step = solve_step(metric, slope, rows, target, lower - total, upper - total, active)
             total = np.clip(total + step.change, lower, upper)
-            target, ell, active = target - present.rows @ step.change, step.ell, step.active
+            target, ell, active = target - rows @ step.change, step.ell, step.active
             if (np.abs(step.change) / self.unit).max(initial=0.0) <= CHORD_TOLERANCE:
                 break
             u = (iterate.point + total)[: self.controls].reshape(u.shape)

@@ -18,7 +18,7 @@ from covocp.models import (
     unknown_gain,
     unknown_lag,
 )
-from covocp.solvers.gradient import one_iteration, prepare
+from covocp.solvers.gradient import influence, iterate, one_iteration, prepare
 from covocp.solving.warm_start import make_guess
 from covocp.transcription.mesh import Options
 
@@ -133,10 +133,20 @@ def test_chord_is_exact_after_one_step(start: float) -> None:
 
 
 def test_chord_with_terminal_conditions_and_free_time() -> None:
-    for problem in (free_time_integrator.problem(), unknown_lag.problem(weight=1.0, final=1.0)):
-        # with a guess no other duration is compared, which takes that variant ten times as long
-        one, two = solve(problem, variant="chord", guess={"u": 0.5}), solve(problem)
+    for problem, guess in (
+        (free_time_integrator.problem(), None),
+        (unknown_lag.problem(weight=1.0, final=1.0), {"u": 0.5}),  # no other side is looked at
+    ):
+        one, two = solve(problem, variant="chord", guess=guess), solve(problem)
         assert one.cost == pytest.approx(two.cost, rel=1e-9)
+
+
+def test_a_chord_step_of_a_quadratic_hamiltonian_takes_one_newton_step_with_a_free_duration_too(monkeypatch) -> None:
+    calls = []
+    monkeypatch.setattr(iterate, "reweigh", lambda *args: calls.append(1) or influence.reweigh(*args))
+    solution = solve(free_time_integrator.problem(), variant="chord", guess={"u": 0.5})
+    # one more where the conditions along the new control are looked at
+    assert len(calls) <= 2 * (solution.stats["iterations"] + 1)
 
 
 CASES = {
