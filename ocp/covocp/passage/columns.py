@@ -74,6 +74,35 @@ def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
     return ca.repmat(shape, 1, count) if shape.nnz() else ca.Sparsity(rows, columns * count)
 
 
+class Told:
+    """A function of scalars as the library is told of it: calls on numbers that lie column after column."""
+
+    def __init__(self, function: ca.Function, listed: Program) -> None:
+        """Keep what the library points to."""
+        self._run = needed()["columns"]
+        shapes = [function.sparsity_in(i) for i in range(function.n_in())]
+        results = [function.sparsity_out(i) for i in range(function.n_out())]
+        self._listed, self._heights = listed, np.array([shape.nnz() for shape in (*shapes, *results)], np.intc)
+        rows, constants = listed
+        self._told = (
+            *(len(rows), rows.ctypes.data, constants.ctypes.data, max(function.sz_w(), 1)),
+            *(len(shapes), self._heights.ctypes.data),
+        )
+        self._places = ctypes.c_void_p * len(self._heights)
+
+    def run(self, addresses: Sequence[int | None], count: int) -> int:
+        """Evaluate it on so many columns.
+
+        Args:
+            addresses: where the nonzeros of each argument, then of each result lie; None: zeros, or not wanted.
+            count: columns.
+
+        Returns:
+            0; else there was no memory.
+        """
+        return int(self._run(*self._told, self._places(*addresses), count))
+
+
 class _Columns(Node):
     """A function of scalars on columns."""
 
@@ -82,26 +111,17 @@ class _Columns(Node):
     ) -> None:
         """Keep what the library is told."""
         self._kept = kept
-        self._function, self._count, self._listed = function, count, listed
+        self._function, self._count, self._told = function, count, Told(function, listed)
         self._derived: dict[tuple[str, int], ca.Function] = {}
-        self._run = needed()["columns"]
         shapes = [function.sparsity_in(i) for i in range(function.n_in())]
         results = [function.sparsity_out(i) for i in range(function.n_out())]
-        self._heights = np.array([shape.nnz() for shape in (*shapes, *results)], np.intc)
-        rows, constants = listed
-        self._told = (
-            *(len(rows), rows.ctypes.data, constants.ctypes.data, max(function.sz_w(), 1)),
-            *(len(shapes), self._heights.ctypes.data),
-        )
-        self._places = ctypes.c_void_p * len(self._heights)
         inputs, outputs = ([beside(shape, count) for shape in each] for each in (shapes, results))
         own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(shapes))], **(options or {})}
         super().__init__(name or f"columns_{function.name()}", inputs, outputs, own)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        places = self._places(*needed()["addresses"]((*arguments, *results)))
-        return int(self._run(*self._told, places, self._count))
+        return self._told.run(needed()["addresses"]((*arguments, *results)), self._count)
 
     def has_jac_sparsity(self, oind: int, iind: int) -> bool:
         """Of CasADi."""

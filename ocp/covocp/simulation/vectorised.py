@@ -1,10 +1,10 @@
-"""A CasADi function evaluated for many columns at once, by one numpy operation for each of its scalar operations.
+"""A CasADi function evaluated for many columns at once, each of its scalar operations over all of them.
 
-CasADi's own `map` works through the whole function for one column after the other; here every operation runs over all
-columns, which is three to five times faster for the small functions of a simulation step. No operation mixes columns,
-and the number of columns is a multiple of `LANES`, so that each is treated by the same vector instructions: a column
-has the same bits whatever its neighbours are. Functions that are not scalar graphs (interpolation tables, linear
-solvers) go through `map`, with the same property.
+CasADi's own `map` works through the whole function for one column after the other. The compiled library does each
+operation on some columns at a time; where it was not built, or does not know an operation, one numpy operation does it
+on all columns. No operation mixes columns, and the number of columns is a multiple of `LANES`, so that each is treated
+by the same vector instructions: a column has the same bits whatever its neighbours are. Functions that are not scalar
+graphs (interpolation tables, linear solvers) go through `map`, with the same property.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.passage.columns import Told
+from covocp.passage.library import functions
+from covocp.passage.operations import program
 
 Mask = npt.NDArray[np.int64]
 # An operation and its arguments, the result last.
@@ -142,6 +145,9 @@ def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Col
     Returns:
         Buffers and what evaluates them; every call overwrites the outputs.
     """
+    listed = program(function) if functions() is not None else None
+    if listed is not None:
+        return _compiled(function, width, shared, Told(function, listed))
     if function.is_a("SXFunction"):
         known = {*OPERATIONS, ca.OP_IF_ELSE_ZERO, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
         if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
@@ -213,14 +219,35 @@ def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> 
     return Columns(inputs=inputs, outputs=outputs, evaluate=evaluate)
 
 
+def _compiled(function: ca.Function, width: int, shared: tuple[int, ...], told: Told) -> Columns:
+    """The scalar graph in the compiled library, on fixed buffers, with what is shared beside each column."""
+    memory, results = _columns_apart(function, width)
+    own = {i: np.zeros(function.size1_in(i)) for i in shared}
+    addresses = [array.ctypes.data for array in (*memory, *results)]
+
+    def evaluate() -> None:
+        for i, values in own.items():
+            memory[i][:] = values
+        if told.run(addresses, width):
+            raise MemoryError
+
+    inputs = tuple(own.get(i, array.T) for i, array in enumerate(memory))
+    return Columns(inputs=inputs, outputs=tuple(array.T for array in results), evaluate=evaluate)
+
+
+def _columns_apart(function: ca.Function, width: int) -> tuple[list[Array], list[Array]]:
+    """Memory for arguments and results, one column after the other."""
+    heights = [function.size1_in(i) for i in range(function.n_in())]
+    answers = [function.size1_out(i) for i in range(function.n_out())]
+    return [np.zeros((width, height)) for height in heights], [np.zeros((width, height)) for height in answers]
+
+
 def _mapped(function: ca.Function, width: int, shared: tuple[int, ...]) -> Columns:
     """CasADi's own map over the columns, on fixed buffers."""
     mapped = function.map("columns", "serial", width, list(shared), [])
-    memory = [
-        np.zeros(function.size1_in(i)) if i in shared else np.zeros((width, function.size1_in(i)))
-        for i in range(function.n_in())
-    ]
-    results = [np.zeros((width, function.size1_out(i))) for i in range(function.n_out())]
+    memory, results = _columns_apart(function, width)
+    for i in shared:
+        memory[i] = np.zeros(function.size1_in(i))
     buffer: Any
     buffer, evaluate = mapped.buffer()
     for i, array in enumerate(memory):
