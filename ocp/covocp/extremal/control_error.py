@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,8 @@ SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 HAT, STEP = (1.0 / 3.0, 64.0 / 15.0), (1.0 / 4.0, 4.0 / 3.0)
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
+# Share of the terms of H_u up to which its change over the magnitude of a control may be rounding: H is linear in it.
+ROUNDING = 1e-8
 # Share of its range within which a control counts as at a bound.
 AT_BOUND = 1e-2
 # Parts of an interval whose ends a polynomial goes through, and its values in the middles of many equal parts.
@@ -104,7 +106,7 @@ def estimate_control_error(
         around = np.repeat(around, points, axis=1)
     along = _Along.of(extremal, 2)
     places = [along.at(j) for j in range(3)]
-    convex = _convex(place[2] for place in places)
+    convex = _convex(places, _magnitudes(extremal))
     if extremal.mesh.step == "rodas":
         total = _by_middles(extremal, along, convex, kinds, places[1][2])
     else:
@@ -158,12 +160,24 @@ class _Along:
         return [stacked(v, n) for v in self.function.evaluated(t.x[at].T, u.T, t.e[at].T, fine.time[None, at], *known)]
 
 
-def _convex(curvatures: Iterable[Array]) -> Mask:
-    """Controls of each interval in which H is strictly convex, all of them together, at all places, (N, nu)."""
-    bends = np.array(list(curvatures))
-    found: Mask = np.all(np.diagonal(bends, axis1=2, axis2=3) > 0, axis=0)
+def _convex(places: Sequence[Sequence[Array]], magnitudes: Array) -> Mask:
+    """Controls of each interval in which H is strictly convex, all of them together, at all places, (N, nu).
+
+    Beyond rounding: over the magnitude of a control its slope changes by more than a share of what this is a sum of.
+    """
+    bends, terms = (np.array([place[k] for place in places]) for k in (2, 3))
+    beyond = np.diagonal(bends, axis1=2, axis2=3) * magnitudes > ROUNDING * terms[..., 0]
+    found: Mask = np.all(beyond, axis=0)
     block = np.where(found[:, :, None] & found[:, None, :], bends, np.eye(bends.shape[-1]))
     return np.asarray(found & (np.linalg.eigvalsh(block)[..., :1] > 0).all(axis=0))
+
+
+def _magnitudes(extremal: Extremal) -> Array:
+    """Of the controls (nu,): the largest on the way, or the range of the bounds; 1 where there is neither."""
+    lower, upper = extremal.statement.control_bounds
+    ranges = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+    found = np.maximum(np.abs(extremal.controls).max(axis=0), ranges)
+    return np.where(found > 0.0, found, 1.0)
 
 
 def _among(convex: Mask, curvature: Array) -> Array:

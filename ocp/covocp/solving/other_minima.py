@@ -17,6 +17,7 @@ from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
+from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.scales import WIDE_BOUNDS, choose_scales, unvanishing
 from covocp.transcription.starts import moving_units
 from covocp.transcription.trajectory import Trajectory
@@ -29,12 +30,16 @@ if TYPE_CHECKING:
 SUSPICIOUS_ITERATIONS = 3
 # A run whose control moved no further than this share of it (or of its unit) ended where it began: the same suspicion.
 UNMOVED = 1e-6
+# So does one that is no further from its guess than this share of its unit, by which it moves some state.
+IDLE = 0.03
 # The same of a decision or an initial state that started beside its guess (`first_guess.BESIDE`).
 UNMOVED_START = 0.03
 # A saddle is left by the size of the controls, or by this share of what moves a state by its scale: in these units a
 # step is none too small for the solver to see, nor so large that it leads to another valley.
 DISPLACEMENT = 0.3
 ESCAPES = (1.0, -1.0)
+# A step to where the curvature alone sees a share of the cost is tried too where it is so many times as long.
+FURTHER = 3.0
 # Share of the cost by which another end must be cheaper than the saddle, to be another one: not the same with roundoff.
 CHEAPER = 1e-9
 
@@ -96,19 +101,22 @@ def _off_saddle(
     from covocp.extremal.optimality import mention_saddle
     from covocp.extremal.worth import HARDLY, worth_telling
 
-    candidates = []
-    for sign in ESCAPES:
-        moved = _displaced(outcome.extremal, curvature, sign)
-        displaced = make_guess(outcome.extremal.statement, prepared.mesh, values, moved)
-        with suppress(CovocpError, RuntimeError):  # outside of the domain of the model; the other side may be within
-            candidates.append(prepared.solve(values, displaced, reporter))
+    limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
+    candidates: list[Outcome] = []
+    for moved in _displaced(outcome.extremal, curvature):
+        for away in moved:
+            displaced = make_guess(outcome.extremal.statement, prepared.mesh, values, away)
+            with suppress(CovocpError, RuntimeError):  # outside of the domain of the model; others may be within
+                candidates.append(prepared.solve(values, displaced, reporter))
+        better = [c for c in candidates if c.converged and cost_of(c) < limit]
+        least = min(map(cost_of, better), default=cost_of(outcome))
+        if reporter.stop or cost_of(outcome) - least > HARDLY * abs(cost_of(outcome)):
+            break
     if not candidates:
         warn_user(
             "The run ended at a saddle (negative curvature of the reduced Hessian), and runs from beside it fail: the "
             "model has no values there. Start from another guess."
         )
-    limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
-    better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
         if candidates and worth_telling(outcome.extremal, curvature):
             mention_saddle(curvature.value / curvature.largest)
@@ -116,8 +124,7 @@ def _off_saddle(
     best = min(better, key=cost_of)
     together = counted(outcome, best) | {name: outcome.stats[name] for name in OF_STARTS if name in outcome.stats}
     if cost_of(outcome) - cost_of(best) <= HARDLY * abs(cost_of(outcome)):
-        if curvature.start.any():
-            _mention_left(best, seconds)
+        _mention_left(best, seconds)
         return with_stats(best, **together)
     warn_user(
         "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
@@ -131,13 +138,13 @@ def _suspicious(outcome: Outcome, start: Guess) -> bool:
     exact = outcome.stats.get("hessian") == "exact"
     if iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0):
         return True
-    if outcome.stats.get("concave") or _stayed(start.trajectory, outcome.extremal):
+    if outcome.stats.get("concave") or _stayed(start, outcome.extremal):
         return True
     return _start_stayed(start, outcome.extremal)
 
 
 def _mention_left(outcome: Outcome, seconds: float) -> None:
-    """Warn where a run from beside a saddle went no further: initial states may be in far too small a unit for it."""
+    """Warn where a run from beside a saddle went no further, as where a state is in far too small a unit for it."""
     from covocp.extremal.optimality import mention_saddle
     from covocp.extremal.worth import worth_telling
 
@@ -146,16 +153,20 @@ def _mention_left(outcome: Outcome, seconds: float) -> None:
         mention_saddle(curvature.value / curvature.largest)
 
 
-def _stayed(before: Trajectory, extremal: Extremal) -> bool:
-    """Whether no control moved by more than a small share of its size or unit."""
-    moved = np.abs(extremal.trajectory.u - before.u).max(axis=0, initial=0.0)
-    sizes = np.abs(before.u).max(axis=0, initial=0.0)
+def _stayed(start: Guess, extremal: Extremal) -> bool:
+    """Whether no control moved by more than a small share of its size or unit, or one came to nothing from a bend."""
+    u, before = extremal.trajectory.u, start.trajectory.u
+    moved, sizes = (np.abs(values).max(axis=0, initial=0.0) for values in (u - before, before))
     if not moved.size:
         return False
     if (moved <= UNMOVED * sizes).all():
         return True
-    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
-    return bool((moved <= UNMOVED * (sizes + units)).all())
+    st = extremal.statement
+    units = choose_scales(st, extremal.mesh, extremal.trajectory, extremal.parameters).u
+    if (moved <= UNMOVED * (sizes + units)).all():
+        return True
+    flat = controls_guess(st, extremal.mesh.nodes, extremal.mesh.control, sign=0.0)
+    return bool(not start.warm and (np.abs(u - flat).max(axis=0) <= IDLE * units).any())
 
 
 def _start_stayed(start: Guess, extremal: Extremal) -> bool:
@@ -173,11 +184,12 @@ def _start_stayed(start: Guess, extremal: Extremal) -> bool:
     return bool((np.abs(t.x[0] - start.trajectory.x[0]) <= share * units)[free].any())
 
 
-def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Trajectory:
-    """The trajectory moved to one side along the direction of the smallest curvature.
+def _displaced(extremal: Extremal, curvature: Curvature) -> list[list[Trajectory]]:
+    """The trajectory moved to both sides along the direction of the smallest curvature; if need be further as well.
 
     Bounds may tell too large a magnitude of an initial state, and none at all where they are left out: it is moved so
     far that by its curvature a share of the cost is gained, between what the bounds count for at least and at most.
+    That may be next to nothing where a state begins near zero and goes far: then by its curvature alone.
     """
     from covocp.extremal.cost_sizes import variable_cost
 
@@ -189,8 +201,15 @@ def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Traject
     for wide in (1.0, WIDE_BOUNDS):
         sizes = DISPLACEMENT * unvanishing(st, extremal.mesh, t, extremal.parameters, wide)
         steps.append(1.0 / max(moved, float((np.abs(curvature.start) / sizes).max(initial=0.0))))
-    seen = np.sqrt(2.0 * DISPLACEMENT**2 * variable_cost(extremal) / abs(curvature.value))
-    step = sign * float(np.clip(seen, steps[0], steps[1]))
+    seen = float(np.sqrt(2.0 * DISPLACEMENT**2 * variable_cost(extremal) / abs(curvature.value)))
+    near = float(np.clip(seen, steps[0], steps[1]))
+    sizes_of_steps = [near] if seen <= FURTHER * near else [near, seen]
+    return [[_beside(extremal, curvature, sign * size) for sign in ESCAPES] for size in sizes_of_steps]
+
+
+def _beside(extremal: Extremal, curvature: Curvature, step: float) -> Trajectory:
+    """The trajectory after a step along the direction of the smallest curvature, within bounds."""
+    t, st = extremal.trajectory, extremal.statement
     x = t.x.copy()
     x[0] = np.clip(x[0] + step * curvature.start, *st.state_bounds)
     x[1:, st.decisions] = x[0, st.decisions]

@@ -40,6 +40,7 @@ from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.from_classical import SOON, impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.held_duration import off_the_limit
+from covocp.solving.longer import from_longer
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
@@ -305,6 +306,7 @@ class Solver(ClassicalRuns):
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
+        outcome, start = from_longer((outcome, start), self._prepared, self._solved, values, guess, reporter)
         ready, where = partial(self._ready, self._options), (values, reporter, start)
         outcome, prepared = in_larger_units(ready, self._prepared, outcome, *where, first=not self._ran)
         self._ran = True

@@ -41,7 +41,13 @@ ROUNDOFF = 1e-24
 
 
 def magnitudes(
-    statement: Statement, guess: Trajectory, parameters: Array, *, reached: bool = False, far: float = 1.0
+    statement: Statement,
+    guess: Trajectory,
+    parameters: Array,
+    *,
+    reached: bool = False,
+    far: float = 1.0,
+    untold_far: bool = False,
 ) -> Scales:
     """Magnitudes from the given scales, boundary values, standard deviations and the trajectory itself.
 
@@ -55,6 +61,7 @@ def magnitudes(
         parameters: of the statement.
         reached: whether a solver found it: then it tells more than scales that were given.
         far: so many times what the measurements resolve.
+        untold_far: whether a state of which nothing tells a magnitude may go as far as the others; else it has 1.
     """
     lower, upper = statement.state_bounds
     ends, deviations = _prescribed(statement, parameters, PRIOR_REACHED if reached else PRIOR_AT_START)
@@ -71,6 +78,9 @@ def magnitudes(
     alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
     least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
     x = np.where(found > NOTHING, np.clip(found, least, span), alone)
+    if untold_far:
+        known = max((found[k] for k in statement.moving), default=0.0)
+        x = np.where(found > NOTHING, x, np.minimum(np.maximum(x, known), span))
     u = np.ones(statement.nu)
     for block in statement.states:
         x[block.span] = _as_given(statement, block, x[block.span], found[block.span] > NOTHING, reached)

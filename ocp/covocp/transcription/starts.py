@@ -358,8 +358,9 @@ def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH, path: A
     x = x if np.isfinite(x).all() else run.start[None, :]
     x = x if path is None else np.vstack([x, path])
     t = Trajectory(x=x, u=flat, e=np.zeros((1, run.statement.ne)), duration=run.duration)
-    # The scale of the run counts wide bounds as well; what measurements resolve is where excitation begins, not ends.
-    scale = magnitudes(run.statement, t, run.parameters, far=WIDE).x
+    # The scale of the run counts wide bounds as well; what measurements resolve is where excitation begins, not ends. A
+    # state that nothing moves yet, such as the way to the side in metres, would allow next to no bend.
+    scale = magnitudes(run.statement, t, run.parameters, far=WIDE, untold_far=True).x
     return _shares(run.statement, sizes, needed_controls(run.statement, run.mesh, t, scale, run.parameters), reach)
 
 

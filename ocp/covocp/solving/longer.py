@@ -1,0 +1,66 @@
+"""Where a run of a free duration ends with conditions that are not met: the guessed duration may be too short.
+
+From a duration in which the controls cannot do what is asked, the slopes of what is missing may lead to no longer one:
+at the end of a flight that overshoots it is later still that more is missing. From longer ones they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.solving.attempts import counted, from_starts, with_stats
+from covocp.solving.warm_start import make_guesses
+from covocp.statement.statement import Duration, Statement
+
+# The guessed duration is made so many times as long, as far as it may.
+LONGER = (2.0, 4.0, 16.0)
+
+
+def from_longer(
+    failed: tuple[Outcome, Guess],
+    prepared: Prepared,
+    statement: Statement,
+    values: Array,
+    guess: Given,
+    reporter: Progress,
+) -> tuple[Outcome, Guess]:
+    """Solve from longer durations where a run from the guessed one has failed with conditions that are not met.
+
+    Args:
+        failed: the outcome, and the start from which it came.
+        prepared: what ran.
+        statement: of the problem.
+        values: of the parameters.
+        guess: what was given as such; a solution's duration is the one that is made longer.
+        reporter: of iterations.
+
+    Returns:
+        The first that converges, with the iterations of all, and its start; else what was given.
+    """
+    outcome, start = failed
+    if outcome.converged or not outcome.violations or not statement.duration.free:
+        return failed
+    named, tried = guess if isinstance(guess, Mapping) else {}, outcome
+    for duration in longer(replace(statement.duration, guess=start.trajectory.duration)):
+        if reporter.stop:
+            break
+        further = replace(statement, duration=replace(statement.duration, guess=duration))
+        try:
+            again, begun = from_starts(prepared, values, make_guesses(further, prepared.mesh, values, named), reporter)
+        except ProblemError:  # the model has no values there
+            continue
+        tried = with_stats(again, **counted(tried, again))
+        if again.converged:
+            return tried, begun
+    return with_stats(outcome, **{name: tried.stats[name] for name in counted(outcome, tried)}), start
+
+
+def longer(duration: Duration) -> list[float]:
+    """Longer ones than the guess, up to the bound [s]."""
+    return sorted({min(factor * duration.guess, duration.upper) for factor in LONGER} - {duration.guess})
