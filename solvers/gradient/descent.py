@@ -114,6 +114,9 @@ def solve_step(
     state = np.zeros(slope.size, dtype=int) if active is None else active.copy()
     for _ in range(ACTIVE_SET_PASSES):
         change, ell, gram = _equality_step(metric, slope, rows, target, np.where(state < 0, lower, upper), state)
+        if metric.learns and not (np.isfinite(change).all() and (np.diag(gram) >= 0.0).all()):
+            # what pairs that hardly differ have shown is lost in rounding: no longer positive definite
+            return solve_step(metric.plain(), slope, rows, target, lower, upper, active)
         pressure = -(slope + metric @ change + rows.T @ ell)
         new = np.where(state == 0, np.where(change > upper, 1, np.where(change < lower, -1, 0)), 0)
         new = np.where((state > 0) & (pressure > 0), 1, np.where((state < 0) & (pressure < 0), -1, new))

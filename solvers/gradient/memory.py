@@ -33,6 +33,15 @@ class Metric:
         self._base, self._columns, self._middle = base, columns, middle
         self._factor = lu_factor(middle) if middle.size else None
 
+    @property
+    def learns(self) -> bool:
+        """Whether it has learnt something."""
+        return self._factor is not None
+
+    def plain(self) -> Metric:
+        """The sparse one alone."""
+        return Metric(self._base, self._columns[:, :0], self._middle[:0, :0])
+
     def __matmul__(self, vector: Array) -> Array:
         """B times a vector or the columns of a matrix."""
         product = np.asarray(self._base @ vector)

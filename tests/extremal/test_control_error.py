@@ -186,3 +186,28 @@ def test_the_error_of_one_control_value_is_not_known():
     solution = co.solve(ocp, intervals=1, control="constant", progress=False)
     assert np.isnan(solution.optimality.control_error)
     assert "NOT KNOWN, with one control value" in str(solution)
+
+
+def watched_by_the_second(*, density: bool) -> co.Problem:
+    """A sensor whose rate costs: the information is linear in it, the density of its noise its inverse."""
+    ocp = co.Problem(4.0)
+    x, w = ocp.state("x", initial=0.0, variance=1.0), ocp.control("w", lower=0.0, upper=1.0)
+    ocp.dynamics(x, -0.5 * x, noise=0.5)
+    rate = (w + 1e-3) / 0.1
+    ocp.measurement("y", x, **({"noise": 1.0 / rate} if density else {"information": rate}))
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.3 * w + E[x, x], terminal=2.0 * E[x, x])
+    return ocp
+
+
+def test_a_rate_of_measurement_is_judged_alike_as_information_and_as_a_density():
+    """Of a density rounding leaves some curvature: the error was told as thousands of times the cost."""
+    options = {"intervals": 12, "progress": False}
+    told, same, finer = (
+        co.solve(watched_by_the_second(density=density), **options | given)
+        for density, given in ((True, {}), (False, {}), (False, {"intervals": 48}))
+    )
+    assert told.cost == pytest.approx(same.cost, rel=1e-6)
+    assert told.optimality.control_error == pytest.approx(same.optimality.control_error, rel=0.5)
+    excess = told.cost / finer.cost - 1.0
+    assert 0.3 * excess < told.optimality.control_error < 10.0 * excess

@@ -231,3 +231,45 @@ def test_what_a_row_is_where_it_never_comes_is_no_unit(center, written):
     cost, nearest = around(center, written)
     assert nearest > 2.0 - 1e-3
     assert cost == pytest.approx(around(0.0, lambda d: (d, 4.0))[0], rel=1e-4)
+
+
+def stays_near(length: float, time: float, aside: float = 0.0, bound: float | None = 0.05) -> co.Problem:
+    """An aircraft of 250 m/s that shall stay where it starts, in other units: straight on is a saddle."""
+    ocp = co.Problem(300.0 * time)
+    x, y = ocp.state("x", initial=0.0), ocp.state("y", initial=aside * length)
+    heading = ocp.state("heading", initial=0.0)
+    u = ocp.control("u", **({} if bound is None else {"lower": -bound / time, "upper": bound / time}))
+    speed = 250.0 * length / time
+    ocp.dynamics(x, speed * ca.cos(heading))
+    ocp.dynamics(y, speed * ca.sin(heading))
+    ocp.dynamics(heading, u)
+    ocp.minimize(running=((x**2 + y**2) / (2e4 * length) ** 2 + 1e3 * (u * time) ** 2) / time)
+    return ocp
+
+
+@pytest.mark.parametrize("bound", [0.05, 1.0])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-3, 1.0), (1e-3, 1 / 60), (1e3, 60.0)])
+def test_bounds_that_are_never_reached_hide_no_minimum(units, bound):
+    """Straight on costs 1406; without bounds the turn is found at once."""
+    free = solve(stays_near(*units, bound=None)).cost
+    assert free == pytest.approx(247.507, rel=1e-5)
+    assert solve(stays_near(*units, bound=bound)).cost == pytest.approx(free, rel=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:The run ended at a saddle")
+def test_a_start_a_little_aside_hides_no_minimum():
+    """One metre is the magnitude that is told of the way to the side, which becomes ten kilometres."""
+    assert solve(stays_near(1.0, 1.0, aside=1.0)).cost == pytest.approx(247.507, rel=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:The (run ended at a saddle|controls change faster)")
+def test_a_heading_in_small_units_is_no_stationary_point():
+    costs = []
+    for length in (1.0, 500.0):
+        ocp = co.Problem(5.0)
+        x, y, u = ocp.state("x", initial=0.0), ocp.state("y", initial=0.0), ocp.control("u")
+        ocp.dynamics(x, length * (ca.cos(u) + 0.1))
+        ocp.dynamics(y, length * ca.sin(u))
+        ocp.minimize(running=0.05 * u**2 + 0.1 * (x**2 + y**2) / length**2)
+        costs.append(solve(ocp).cost)
+    assert costs[1] < 1.05 * costs[0]

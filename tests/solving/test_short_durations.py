@@ -1,0 +1,57 @@
+"""Free durations whose guess is too short for what the controls can do."""
+
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp import SolveError
+
+
+def to_rest(position, speed, guess, *, spring=0.0, upper=60.0):
+    """Least time to rest at zero with |u| <= 1."""
+    ocp = co.Problem(co.Free(guess, 0.01, upper))
+    x, v = ocp.state("x", initial=position, final=0.0), ocp.state("v", initial=speed, final=0.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - spring * x)
+    ocp.minimize(terminal=ocp.duration)
+    return ocp
+
+
+def least_time(position, speed):
+    """Of the double integrator: full thrust towards the curve that leads to rest, then full thrust back."""
+    side = np.sign(position + 0.5 * speed * abs(speed))
+    return side * speed + 2.0 * np.sqrt(0.5 * speed**2 + side * position)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "auto", "gradient"])
+@pytest.mark.parametrize(("distance", "excess", "share"), [(2.0, 1.01, 0.8), (10.0, 1.03, 0.5), (50.0, 1.1, 0.8)])
+def test_who_brakes_too_late_turns_back(method, distance, excess, share):
+    start = distance, -excess * np.sqrt(2.0 * distance)
+    exact = least_time(*start)
+    solution = co.solve(to_rest(*start, share * exact), method=method, progress=False)
+    assert solution.cost == pytest.approx(exact, rel=1e-3)
+
+
+@pytest.mark.parametrize("guess", [1.0, 6.0])
+def test_a_swinging_mass_is_stopped_from_any_guess(guess):
+    problem = to_rest(4.3, -2.1, guess, spring=1.0)
+    far = co.solve(to_rest(4.3, -2.1, 12.0, spring=1.0), progress=False)
+    assert co.solve(problem, progress=False).cost == pytest.approx(far.cost, rel=1e-6)
+
+
+def test_a_bound_of_the_duration_is_kept_and_what_is_missing_is_told():
+    with pytest.raises(SolveError, match="violated constraints") as caught:
+        co.solve(to_rest(2.0, -2.02, 1.5, upper=2.2), progress=False)
+    assert caught.value.solution.duration <= 2.2 * (1 + 1e-6)
+
+
+def test_iterations_count_those_of_all_durations():
+    late, early = (co.solve(to_rest(2.0, -2.02, guess), progress=False) for guess in (4.0, 2.0))
+    assert early.stats["iterations"] > late.stats["iterations"]
+
+
+def test_a_limit_of_iterations_holds_for_all_durations():
+    solution = co.Solver(to_rest(2.0, -2.02, 2.0)).solve(iteration_limit=12, progress=False)
+    assert not solution.converged
+    assert solution.stats["iterations"] <= 13
