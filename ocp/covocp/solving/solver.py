@@ -40,6 +40,7 @@ from covocp.solving.from_best_gain import bounded_below, from_best, part
 from covocp.solving.from_classical import SOON, impatient
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.held_duration import off_the_limit
+from covocp.solving.kept_near import kept_near
 from covocp.solving.longer import from_longer
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
@@ -310,6 +311,10 @@ class Solver(ClassicalRuns):
         ready, where = partial(self._ready, self._options), (values, reporter, start)
         outcome, prepared = in_larger_units(ready, self._prepared, outcome, *where, first=not self._ran)
         self._ran = True
+        if not outcome.converged and self._by_ipopt:
+            near, mesh = partial(self._ready, self._options, by="ipopt"), self._prepared.mesh
+            guesses = partial(make_guesses, self._solved, mesh, values, guess)
+            outcome, prepared = kept_near(near, prepared, outcome, guesses, reporter, self._own)
         if not outcome.converged:
             outcome, prepared = self._from_classical(outcome, prepared, values, reporter)
         if prepared is not self._prepared:
