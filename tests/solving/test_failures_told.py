@@ -174,3 +174,31 @@ def test_the_other_formulation_of_the_covariances_is_named(asked, named):
         co.solve(ocp, covariances=asked, max_iterations=1, progress=False)
     assert named in str(failed.value)
     assert ("covariances=" in str(failed.value)) == bool(named)
+
+
+def test_a_limit_that_the_given_start_passes_is_told_with_what_is_given():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.2), ocp.control("u")
+    y = ocp.state("y", initial=1.0)
+    ocp.dynamics(x, u)
+    ocp.dynamics(y, -y)
+    ocp.subject_to(2.0 * x, upper=0.3, name="doubled")
+    ocp.subject_to(x + u, upper=0.1, name="with a control")
+    ocp.minimize(running=u**2)
+    with pytest.raises(co.SolveError) as caught:
+        co.solve(ocp, progress=False)
+    assert "\n  doubled is 0.4 at the start, by what is given there, and shall be at most 0.3.\n" in str(caught.value)
+    assert "with a control is" not in str(caught.value)
+
+
+def test_a_covariance_that_begins_above_its_limit_is_told_and_no_other_way():
+    ocp = co.Problem(1.0)
+    x, w = ocp.state("x", initial=0.0, variance=0.2), ocp.control("w", lower=0.0, upper=5.0)
+    ocp.dynamics(x, -x, noise=0.01)
+    ocp.measurement("y", x, information=w)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(E[x, x], upper=0.12, name="knowledge")
+    ocp.minimize(running=w**2)
+    with pytest.raises(co.SolveError, match="knowledge is 0.2 at the start, .* at most 0.12") as caught:
+        co.solve(ocp, progress=False)
+    assert "covariances=" not in str(caught.value)

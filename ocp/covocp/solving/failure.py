@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.errors import SolveError
@@ -26,6 +27,8 @@ MANY, MOST = 100, 0.5
 NAMED = 10
 # How rows begin that keep a state or matrix in one piece.
 GAP = "continuity of "
+# Share of a value that it may be beyond its limit by rounding.
+GIVEN = 1e-9
 CONTRADICT = "the constraints may contradict"
 
 AnyOutcome = TypeVar("AnyOutcome", Outcome, "ChainOutcome")
@@ -49,13 +52,30 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     lines = [f"  {row}: {value:.6g}" for row, value in stated_first(violations)[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
     noise = impossible_noises([outcome.extremal], outcome.message)
+    given = _passed_at_the_start(outcome)
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
-        f"{violated}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{other_way}"
+        f"{violated}{given}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{'' if given else other_way}"
         "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
         solution=solution,
         violations=violations,
     )
+
+
+def _passed_at_the_start(outcome: Outcome) -> str:
+    """A line for each limit along the path that what is given at the start passes, whatever the controls are."""
+    st, p = outcome.extremal.statement, outcome.extremal.parameters
+    x0, _, e0, _ = st.boundary_values(p)
+    # what is not given is no number, nor is then what depends on it
+    known = st.path.function(x0, np.full(st.nu, np.nan), e0, 0.0, outcome.extremal.trajectory.duration, p)
+    values = np.asarray(ca.DM(known).full()).ravel()
+    lines = []
+    for name, value, low, high in zip(st.path.names, values, st.path.lower, st.path.upper, strict=True):
+        excess = max(low - value, value - high)
+        if name in outcome.violations and excess > GIVEN * max(abs(value), outcome.violations[name]):
+            side = f"at most {high:.6g}" if value > high else f"at least {low:.6g}"
+            lines.append(f"\n  {name} is {value:.6g} at the start, by what is given there, and shall be {side}.")
+    return "".join(lines)
 
 
 def _passed_along(outcome: Outcome) -> dict[str, float]:
