@@ -366,8 +366,9 @@ class Solution:
 
         Returns:
             Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes (what acts
-            between two nodes is shared between them); of terminal and initial ones and of those at an instant () or
-            (rows,); of a state () or (n,); of a matrix (n, n).
+            between two nodes is shared between them), whose sum the cost falls by for one unit more room at all times;
+            of terminal and initial ones and of those at an instant () or (rows,); of a state () or (n,); of a matrix
+            (n, n).
 
         Raises:
             ProblemError: where there is no such constraint or symbol.
