@@ -18,7 +18,7 @@ FORMS = ("eliminated", "states")
 
 @pytest.fixture(scope="module", params=FORMS)
 def bounced(request: pytest.FixtureRequest) -> co.PhasesSolution:
-    return co.solve(bounce(), intervals=40, covariances=request.param, tolerance=1e-9, **QUIET)
+    return co.solve(bounce(), intervals=20, covariances=request.param, tolerance=1e-9, **QUIET)
 
 
 @pytest.mark.parametrize("form", FORMS)
