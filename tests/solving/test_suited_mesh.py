@@ -28,7 +28,7 @@ def actuator(rate=RATE, duration=5.0):
 
 
 def integrated(solution, rate):
-    """The cost along the controls of a solution by an integrator of scipy that is implicit where it is stiff, rows x, a, E_xx, E_xb, E_bb, cost."""
+    """The cost along the controls of a solution by LSODA of scipy, rows x, a, E_xx, E_xb, E_bb, cost."""
 
     def slope(t, y):
         x, a = y[:2]
