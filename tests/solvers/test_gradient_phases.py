@@ -46,8 +46,8 @@ def test_a_problem_cut_in_two_costs_what_the_whole_costs(kind: str) -> None:
 
 @pytest.mark.parametrize("make", [bounce, phased_loops.bounce])
 def test_both_methods_agree_through_a_jump_with_a_free_duration(make: Any) -> None:
-    by_gradient = co.solve(make(), method="gradient", intervals=14, **QUIET)
-    by_shooting = co.solve(make(), intervals=14, tolerance=1e-9, **QUIET)
+    by_gradient = co.solve(make(), method="gradient", intervals=20, **QUIET)
+    by_shooting = co.solve(make(), intervals=20, tolerance=1e-9, **QUIET)
     assert by_gradient.cost == pytest.approx(by_shooting.cost, rel=1e-10)
     assert by_gradient.durations == pytest.approx(by_shooting.durations, rel=1e-5)
     assert max(by_gradient.link_residuals) < 1e-5
@@ -169,8 +169,8 @@ def bent_jump() -> co.Phases:
 
 def test_costates_where_the_weight_of_a_phase_depends_on_where_it_ends():
     """The slope through S(T) had been taken off multipliers that do not contain it: 2 % of the costate of the speed."""
-    shot, found = (co.solve(bent_jump(), method, intervals=10, progress=False) for method in ("ipopt", "gradient"))
-    along = co.evaluate(bent_jump(), nominal=shot, intervals=10)
+    shot, found = (co.solve(bent_jump(), method, intervals=20, progress=False) for method in ("ipopt", "gradient"))
+    along = co.evaluate(bent_jump(), nominal=shot, intervals=20)
     for name in ("before", "after"):
         assert found[name].optimality.stationarity < 1e-4
         for other, tolerance in ((found, 1e-3), (along, 1e-5)):

@@ -59,7 +59,7 @@ def test_wall_in_other_meshes():
 @pytest.mark.parametrize("limits", [(0.15, 0.05), (0.02, 0.05)])
 def test_terminal_ellipse_costs_what_duality_says(limits):
     fed, weights = ellipse_by_duality(limits)
-    solution = co.Solver(ellipse(limits), intervals=80).solve(assess=False, progress=False)
+    solution = co.solve(ellipse(limits), intervals=80, progress=False)
     assert solution.cost == pytest.approx(NOMINAL + fed, rel=2e-4)
     assert solution.cost >= (NOMINAL + fed) * (1 - 1e-5)
     final = np.diagonal(solution.covariance("x")[-1:], axis1=1, axis2=2)[0, 0]
@@ -74,7 +74,7 @@ def test_terminal_ellipse_in_other_units():
 
 
 def test_margin_of_the_actuator_is_kept_in_simulation():
-    solution = co.solve(margin(0.75), intervals=40, progress=False)
+    solution = co.solve(margin(0.75), intervals=60, progress=False)
     runs = co.simulate(solution, runs=RUNS, seed=2, progress=False)
     u, spread = (
         solution["u"],
@@ -86,7 +86,7 @@ def test_margin_of_the_actuator_is_kept_in_simulation():
 
 
 def test_margin_that_leaves_the_feedback_nothing():
-    tight = [co.solve(margin(0.6, smallest=s), intervals=15, progress=False).cost for s in (1e-3, 1e-4)]
+    tight = [co.solve(margin(0.6, smallest=s), intervals=30, progress=False).cost for s in (1e-3, 1e-4)]
     assert tight[0] == pytest.approx(tight[1], rel=1e-4)
 
 

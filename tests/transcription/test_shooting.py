@@ -495,7 +495,7 @@ def test_problem_without_control():
 
 def test_path_inequality_on_a_large_covariance():
     """36 entries: eliminated, and the same minimum as with the entries as variables; the constraint binds."""
-    free = solve(mass_chain.problem(masses=3), intervals=30)
+    free = solve(mass_chain.problem(masses=3), intervals=50)
     bound = ca.interpolant("bound", "linear", [free.t], 0.85 * free["E"][:, 6, 6])
     solutions = {}
     for formulation in ("auto", "states"):
@@ -503,7 +503,7 @@ def test_path_inequality_on_a_large_covariance():
         (covariance,) = problem.declarations.matrices
         stiffness = covariance.matrix[6, 6]
         problem.subject_to(stiffness - bound(problem.time) - 0.25 * ca.exp(-0.4 * problem.time), name="stiffness")
-        solutions[formulation] = solve(problem, covariances=formulation, intervals=30)
+        solutions[formulation] = solve(problem, covariances=formulation, intervals=50)
     auto = solutions["auto"]
     assert auto.mesh.eliminated
     assert auto.cost == pytest.approx(solutions["states"].cost, rel=1e-7)
