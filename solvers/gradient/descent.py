@@ -111,9 +111,12 @@ def solve_step(
     Returns:
         The step. Where the active set does not settle, the change is clipped.
     """
-    state = np.zeros(slope.size, dtype=int) if active is None else active.copy()
+    state = np.zeros(slope.size, dtype=int) if active is None else active.astype(int)
+    tried: list[tuple[Array, tuple[Array, Array, Array]]] = []  # which entries were active, and the step with these
+    places: dict[bytes, int] = {}
     for _ in range(ACTIVE_SET_PASSES):
-        change, ell, gram = _equality_step(metric, slope, rows, target, np.where(state < 0, lower, upper), state)
+        found = _equality_step(metric, slope, rows, target, np.where(state < 0, lower, upper), state)
+        change, ell, gram = found
         if metric.learns and not (np.isfinite(change).all() and (np.diag(gram) >= 0.0).all()):
             # what pairs that hardly differ have shown is lost in rounding: no longer positive definite
             return solve_step(metric.plain(), slope, rows, target, lower, upper, active)
@@ -122,7 +125,15 @@ def solve_step(
         new = np.where((state > 0) & (pressure > 0), 1, np.where((state < 0) & (pressure < 0), -1, new))
         if (new == state).all():
             break
+        places[state.tobytes()] = len(tried)
+        tried.append((state, found))
         state = new
+        begin = places.get(new.tobytes())
+        if begin is not None:  # from here on the same sets come in turn: those of the last pass are known
+            period, left = len(tried) - begin, ACTIVE_SET_PASSES - begin
+            found, state = tried[begin + (left - 1) % period][1], tried[begin + left % period][0]
+            break
+    change, ell, gram = found
     return Step(change=np.clip(change, lower, upper), ell=ell, active=state, gram=gram)
 
 

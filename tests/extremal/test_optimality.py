@@ -210,7 +210,7 @@ def test_covariance_steps_that_explode_are_refused_by_name():
 
 def test_substeps_follow_the_stiffness():
     """Chosen for rk4 where it would explode otherwise; 5.2 with U = 1e-3 then costs what gauss finds."""
-    solution = solve(lag(10.0, 0.0, noise=1e-3).problem, covariance_step="rk4", intervals=400)
+    solution = solve(lag(10.0, 0.0, noise=1e-3).problem, covariance_step="rk4", intervals=200)
     assert solution.mesh.substeps > 1
     assert solution.cost == pytest.approx(4.5802190, rel=1e-6)
 

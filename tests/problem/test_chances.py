@@ -197,13 +197,13 @@ def test_limits_that_the_error_of_the_filter_alone_passes_are_named():
             ocp.chance(x, at="final", probability=0.95, name="tight", **limits)
         return ocp
 
-    s = np.sqrt(co.solve(steered(), intervals=20, progress=False).loop.E[-1, 0, 0])
+    s = np.sqrt(co.solve(steered(), intervals=10, progress=False).loop.E[-1, 0, 0])
     for limits, wider in (
         ({"lower": 0.98, "upper": 1.02}, norm.isf(0.025) * s - 0.02),
         ({"upper": 1.1}, norm.isf(0.05) * s - 0.1),
     ):
         with pytest.raises(co.SolveError, match=r"no feedback takes X below E.*'tight'") as caught:
-            co.solve(steered(**limits), intervals=20, progress=False)
+            co.solve(steered(**limits), intervals=10, progress=False)
         said = float(str(caught.value).split("would have to be ")[1].split(" wider")[0])
         assert said == pytest.approx(wider, rel=5e-3)
 

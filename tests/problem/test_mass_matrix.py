@@ -28,7 +28,7 @@ def cost(by, more):
     ocp.measurement("position", x[0], noise=0.02)
     ocp.minimize_expected(running=0.1 * u**2 + (x[0] - 1) ** 2)
     more(ocp, x, by(M, x))
-    return co.solve(ocp, intervals=20, progress=False).cost
+    return co.solve(ocp, intervals=8, progress=False).cost
 
 
 STATED = {

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 from refusals import refused
+from scipy import sparse
 
 import covocp as co
+from covocp.solvers.gradient import descent
+from covocp.solvers.gradient.memory import learnt
 
 INTERVALS = 20
 
@@ -101,6 +104,30 @@ def test_a_covariance_that_given_steps_blow_up():
     assert "guess" not in message
     fine = co.Solver(ocp, "gradient", intervals=INTERVALS, substeps=1).solve({"r": 1e-3}, progress=False)
     assert fine.cost == pytest.approx(1.0 + 1.0 / (1.0 + 1e3), rel=1e-6)
+
+
+def test_active_sets_that_come_in_turn_are_those_of_the_last_pass(monkeypatch):
+    """Where conditions contradict bounds they do not settle; what the last pass would end with is known before."""
+    random, made = np.random.default_rng(0), []
+    tried = descent._equality_step
+    monkeypatch.setattr(descent, "_equality_step", lambda *given: made.append(1) or tried(*given))
+    for _ in range(40):
+        root, slope = random.normal(size=(12, 12)), 3.0 * random.normal(size=12)
+        metric = learnt(sparse.csc_array(root @ root.T + 0.05 * np.eye(12)), [])
+        rows, target = random.normal(size=(2, 12)), 20.0 * random.normal(size=2)
+        lower, upper = -random.uniform(size=12), random.uniform(size=12)
+        found = descent.solve_step(metric, slope, rows, target, lower, upper)
+        state = np.zeros(12, dtype=int)
+        for _ in range(descent.ACTIVE_SET_PASSES):
+            change, ell, _ = tried(metric, slope, rows, target, np.where(state < 0, lower, upper), state)
+            pressure, before = -(slope + metric @ change + rows.T @ ell), state
+            beyond = np.where(change > upper, 1, np.where(change < lower, -1, 0))
+            state = np.where(before == 0, beyond, np.where(before * pressure > 0, before, 0))
+            if (state == before).all():
+                break
+        np.testing.assert_array_equal(found.active, state)
+        np.testing.assert_allclose(found.change, np.clip(change, lower, upper), atol=1e-9)
+    assert len(made) < 40 * descent.ACTIVE_SET_PASSES * 0.8
 
 
 @pytest.mark.filterwarnings("ignore:The controls change faster")  # it halves within an interval

@@ -124,15 +124,15 @@ def test_a_cone_is_kept_between_the_nodes_as_check_path_says():
 def test_the_covariance_of_a_turning_attitude_against_scipy():
     """Errors in body axes, d' = domega - omega x d; a star z = C s is seen at z + z x d."""
     ocp, attitude = tracked()
-    solution = co.solve(ocp)
-    J, u = INERTIA, solution["torque"]
+    solution = co.solve(ocp, intervals=50)
+    J, u, nodes = INERTIA, solution["torque"], solution.t
 
     def cross(v):
         return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
     def rate(t, y):
         w, C, P = y[:3], y[3:12].reshape(3, 3), y[12:].reshape(9, 9)
-        control = np.array([np.interp(t, solution.t, u[:, i]) for i in range(3)])
+        control = np.array([np.interp(t, nodes, u[:, i]) for i in range(3)])
         F, M = np.zeros((9, 9)), np.zeros((6, 9))
         F[:3, :3] = np.linalg.solve(J, cross(J @ w) - cross(w) @ J)
         F[3:6, :3], F[3:6, 3:6] = np.eye(3), -cross(w)
@@ -150,7 +150,7 @@ def test_the_covariance_of_a_turning_attitude_against_scipy():
     assert solution["E"][-1] == pytest.approx(true, abs=1e-7 * np.abs(true).max())
     assert solution.deviation(attitude)[-1] == pytest.approx(np.sqrt(np.diag(true)[3:6]), rel=1e-6)
     assert solution.covariance(attitude, "bias")[-1] == pytest.approx(true[3:6, 6:], abs=1e-7 * np.abs(true).max())
-    strang = co.solve(ocp, covariance_step="strang")
+    strang = co.solve(ocp, intervals=50, covariance_step="strang")
     assert strang.cost == pytest.approx(solution.cost, rel=1e-3)
 
 
@@ -162,8 +162,8 @@ def test_formulations_and_methods_agree_on_the_knowledge_of_an_attitude():
     ocp.measurement("boresight", attitude.matrix[0, :].T, 1e-2)
     E = ocp.estimation_covariance()
     ocp.minimize(running=ca.sumsqr(rate), terminal=100.0 * E["attitude[0]", "attitude[0]"])
-    costs = [co.solve(ocp, covariances=kind, intervals=20).cost for kind in ("eliminated", "states")]
-    costs.append(co.solve(ocp, "gradient", intervals=20).cost)
+    costs = [co.solve(ocp, covariances=kind, intervals=10).cost for kind in ("eliminated", "states")]
+    costs.append(co.solve(ocp, "gradient", intervals=10).cost)
     assert costs[1:] == pytest.approx(costs[:1] * 2, rel=1e-6)
 
 

@@ -68,7 +68,7 @@ def test_a_variance_that_is_limited_where_phases_meet(form: str) -> None:
     """The multiplier is the slope of the cost by the limit; a limit that is met anyway costs nothing."""
     options = {"intervals": 20, "covariances": form, **QUIET}
     found, step = co.solve(known_at_four(1.0), **options), 1e-3
-    near = [co.solve(known_at_four(1.0 + way * step), **options).cost for way in (-1, 1)]
+    near = [co.solve(known_at_four(1.0 + way * step), guess=found, **options).cost for way in (-1, 1)]
     multiplier = float(found["before"].multiplier("accuracy"))
     assert multiplier > 1.0
     assert multiplier == pytest.approx((near[0] - near[1]) / (2 * step), rel=1e-5)

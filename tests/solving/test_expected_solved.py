@@ -240,23 +240,23 @@ def bounded(upper=0.5):
 
 @cache
 def bounded_solution(covariances):
-    return solve(bounded(), intervals=24, covariances=covariances)
+    return solve(bounded(), intervals=12, covariances=covariances)
 
 
 def test_vector_state_with_bounds():
     """Both formulations, both bounds active; less than the classical design, which meets the same bounds."""
     one, two = (bounded_solution(c) for c in COVARIANCES)
-    stated = solve(bounded(), intervals=24, covariances="states", covariance_step="gauss")
+    stated = solve(bounded(), intervals=12, covariances="states", covariance_step="gauss")
     assert one.cost == pytest.approx(stated.cost, rel=1e-7)  # the same equations; by default other steps, of order 4
     for solution in (one, two, stated):
         assert solution["x"][:, 1].max() == pytest.approx(0.5, abs=2e-6)
         assert solution["u"].min() == pytest.approx(-0.5, abs=2e-6)
         np.testing.assert_allclose(solution["x"][-1], [1.0, 0.0], atol=1e-6)
         assert solution.optimality.stationarity < 1e-5
-    classical = solve(bounded(), intervals=24, nominal="deterministic")
+    classical = solve(bounded(), intervals=12, nominal="deterministic")
     assert one.stats["classical_cost"] == pytest.approx(classical.cost, rel=1e-6)
     assert one.cost < classical.cost - 1e-3
-    assert one.cost > solve(bounded(upper=5.0), intervals=24).cost
+    assert one.cost > solve(bounded(upper=5.0), intervals=12).cost
 
 
 # --- free duration ----------------------------------------------------------------------------------------------------

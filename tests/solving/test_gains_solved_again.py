@@ -29,10 +29,10 @@ def loop(kind: str, q: float = 0.01, start: float = 0.0) -> co.Problem:
     ("given", "declared"), [({"parameters": {"q": 0.02}}, {"q": 0.02}), ({"initial": {"x": 0.5}}, {"start": 0.5})]
 )
 def test_gradient_steps_solve_again_what_ipopt_solves(kind, given, declared):
-    solver = co.Solver(loop(kind), "gradient", intervals=30)
+    solver = co.Solver(loop(kind), "gradient", intervals=20)
     before = solver.solve(progress=False)
     found = solver.solve(progress=False, **given)
-    fresh = co.solve(loop(kind, **declared), "ipopt", intervals=30, progress=False)
+    fresh = co.solve(loop(kind, **declared), "ipopt", intervals=20, progress=False)
     assert found.cost == pytest.approx(fresh.cost, rel=2e-5)  # the mesh of the former is graded for what was declared
     assert abs(found.cost / before.cost - 1) > 1e-3
     assert solver.solve(progress=False).cost == pytest.approx(before.cost, rel=1e-7)

@@ -52,11 +52,11 @@ def flown(solution):
     A, B, M = np.array([[0, 20, 0], [0, 0, 7.4], [0, 0, 0]]), np.array([[0.0], [0.0], [1.0]]), np.array([[1.0, 0, 0]])
     process, measured = np.diag([0.01, 1e-4, 0.0]), 0.01
     running, last = np.diag([0.01, 0.0, 10.0]), np.diag([1.0, 10.0, 1.0])
-    inputs = np.column_stack([solution["rate"], solution.gains["C"][:, 0, :]])
+    nodes, inputs = solution.t, np.column_stack([solution["rate"], solution.gains["C"][:, 0, :]])
 
     def rate(t, z):
         x, E, X = z[:3], z[3:12].reshape(3, 3), z[12:21].reshape(3, 3)
-        u, *C = (np.interp(t, solution.t, column) for column in inputs.T)
+        u, *C = (np.interp(t, nodes, column) for column in inputs.T)
         C, K = np.array([C]), E @ M.T / measured
         gained = K @ K.T * measured
         loop = (A - B @ C) @ X
@@ -66,7 +66,7 @@ def flown(solution):
 
     z = np.concatenate([np.zeros(3), np.diag([0.04, 1e-4, 0.0]).ravel(), np.zeros(10)])
     for begin, end in pairwise(solution.t):
-        z = solve_ivp(rate, (begin, end), z, rtol=1e-8, atol=1e-12).y[:, -1]
+        z = solve_ivp(rate, (begin, end), z, method="DOP853", rtol=1e-8, atol=1e-12).y[:, -1]
     return z[-1] + np.trace(last @ (z[3:12] + z[12:21]).reshape(3, 3)) / 2
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -42,23 +43,42 @@ def best():
     return co.solve(swung(limited=False), **INTERVALS).cost
 
 
-@pytest.fixture(scope="module")
-def by_hessian():
-    """A duration for which the approximate Hessian is another way, and the cost of the best gain there."""
+@dataclass(frozen=True)
+class Creeping:
+    """Two solves by one solver whose first run creeps along the gain, and the cost of the best gain."""
+
+    first: co.Solution
+    second: co.Solution
+    best: float
+
+
+def solved_twice(duration, method, options, best):
+    again = co.Solver(swung(duration), method, intervals=30, **options)
+    return Creeping(first=again.solve(progress=False), second=again.solve(progress=False), best=best)
+
+
+@cache
+def by_steps(method):
+    return solved_twice(4.0, method, {"substeps": 1}, co.solve(swung(limited=False), **INTERVALS).cost)
+
+
+@cache
+def by_hessian(method):
+    """For a duration for which the approximate Hessian is another way."""
+    if method == "auto":
+        found = by_hessian("ipopt")
+        return solved_twice(found.first.duration, method, RK4, found.best)
     for duration in DURATIONS:
         try:
-            found = co.solve(swung(duration), **RK4, **INTERVALS)
+            found = solved_twice(duration, method, RK4, 0.0)
         except co.SolveError:
             continue
-        if "found by hessian='limited-memory'" in str(found):
-            return duration, co.solve(swung(duration, limited=False), **INTERVALS).cost
+        if "found by hessian='limited-memory'" in str(found.first):
+            return replace(found, best=co.solve(swung(duration, limited=False), **INTERVALS).cost)
     raise AssertionError("the approximate Hessian finds the optimum for none of the durations")
 
 
-@pytest.fixture
-def creeping(request, best, by_hessian):
-    """Options, duration and best cost of a run that creeps along the gain, by the way that finds the optimum."""
-    return {"steps": ({"substeps": 1}, 4.0, best), "hessian": (RK4, *by_hessian)}[request.param]
+CREEPING = {"steps": by_steps, "hessian": by_hessian}
 
 
 def test_a_condition_that_does_not_act_leaves_the_best_gain(best):
@@ -69,18 +89,16 @@ def test_a_condition_that_does_not_act_leaves_the_best_gain(best):
 
 @pytest.mark.filterwarnings("ignore:This is no minimum")  # on long steps, as the printout says
 @pytest.mark.parametrize(
-    ("creeping", "step", "by"),
+    ("kind", "step", "by"),
     [("steps", "gauss", "covariance_step='gauss'"), ("hessian", "rk4", "hessian='limited-memory'")],
-    indirect=["creeping"],
     ids=["steps", "hessian"],
 )
-def test_a_run_that_creeps_along_the_gain_goes_another_way(creeping, step, by):
+def test_a_run_that_creeps_along_the_gain_goes_another_way(kind, step, by):
     """As by one step an interval, which leaves the gain at the start free."""
-    options, duration, best = creeping
-    found = co.solve(swung(duration), **INTERVALS, **options)
-    assert found.cost == pytest.approx(best, rel=1e-5)
-    assert found.mesh.step == step
-    assert f"found by {by}" in str(found)
+    creeping = CREEPING[kind]("ipopt")
+    assert creeping.first.cost == pytest.approx(creeping.best, rel=1e-5)
+    assert creeping.first.mesh.step == step
+    assert f"found by {by}" in str(creeping.first)
 
 
 def test_where_none_is_tried_they_are_named():
@@ -110,26 +128,23 @@ def raising(monkeypatch, where):
 
 
 @pytest.mark.filterwarnings("ignore:This is no minimum")  # on long steps, as the printout says
-def test_without_the_option_of_the_hessian_ipopt_is_another_way(by_hessian):
+def test_without_the_option_of_the_hessian_ipopt_is_another_way():
     """The method "auto" has none; it lets Ipopt run where a gain is free."""
-    duration, best = by_hessian
-    auto = co.Solver(swung(duration), "auto", intervals=30, **RK4)
-    found = auto.solve(progress=False)
-    assert found.cost == pytest.approx(best, rel=1e-5)
-    assert "found by method='ipopt' with hessian='limited-memory'" in str(found)
-    assert found.method == auto.solve(progress=False).method == "ipopt"
+    auto = by_hessian("auto")
+    assert auto.first.cost == pytest.approx(auto.best, rel=1e-5)
+    assert "found by method='ipopt' with hessian='limited-memory'" in str(auto.first)
+    assert auto.first.method == auto.second.method == "ipopt"
     with pytest.raises(co.SolveError, match="method='ipopt' with hessian='limited-memory' may find a way"):
         co.solve(swung(), method="auto", max_iterations=60, **RK4, **INTERVALS)
 
 
 @pytest.mark.parametrize("method", ["ipopt", "auto"])
-@pytest.mark.parametrize("creeping", ["steps", "hessian"], indirect=True)
-def test_later_solves_begin_the_way_that_found_a_solution(creeping, method):
-    options, duration, best = creeping
-    again = co.Solver(swung(duration), method, intervals=30, **options)
-    first, second = again.solve(progress=False), again.solve(progress=False)
-    assert first.cost == pytest.approx(best, rel=1e-5)
-    assert second.cost == pytest.approx(best, rel=1e-5)
+@pytest.mark.parametrize("kind", ["steps", "hessian"])
+def test_later_solves_begin_the_way_that_found_a_solution(kind, method):
+    creeping = CREEPING[kind](method)
+    first, second = creeping.first, creeping.second
+    assert first.cost == pytest.approx(creeping.best, rel=1e-5)
+    assert second.cost == pytest.approx(creeping.best, rel=1e-5)
     assert second.stats["iterations"] < first.stats["iterations"] - 350  # the first run ended in vain after 400
     assert "other_ways" not in second.stats
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -16,9 +17,14 @@ QUIET: dict[str, Any] = {"progress": False}
 FORMS = ("eliminated", "states")
 
 
-@pytest.fixture(scope="module", params=FORMS)
+@cache
+def bounced_by(form: str) -> co.PhasesSolution:
+    return co.solve(bounce(), intervals=20, covariances=form, tolerance=1e-9, **QUIET)
+
+
+@pytest.fixture(params=FORMS)
 def bounced(request: pytest.FixtureRequest) -> co.PhasesSolution:
-    return co.solve(bounce(), intervals=40, covariances=request.param, tolerance=1e-9, **QUIET)
+    return bounced_by(request.param)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -172,7 +178,7 @@ def test_the_necessary_conditions_hold_in_each_phase(bounced: co.PhasesSolution)
 
 
 def test_both_formulations_agree() -> None:
-    costs = [co.solve(bounce(), intervals=20, covariances=f, tolerance=1e-9, **QUIET).cost for f in FORMS]
+    costs = [bounced_by(form).cost for form in FORMS]
     assert costs[0] == pytest.approx(costs[1], rel=1e-8)
 
 
@@ -185,7 +191,7 @@ def test_costates_of_the_first_covariance_are_slopes_of_the_cost_of_all_phases()
 
 
 def test_a_limit_of_a_variance_at_the_end_of_a_later_phase_is_met() -> None:
-    free = co.solve(bounce(), intervals=20, **QUIET)
+    free = bounced_by("eliminated")
     limit = float(0.98 * free["rise"].values["E"][-1][1, 1])
     found = [co.solve(bounce(upper=limit), intervals=20, covariances=form, **QUIET) for form in FORMS]
     for solution in found:
