@@ -199,6 +199,6 @@ def test_a_covariance_that_begins_above_its_limit_is_told_and_no_other_way():
     E = ocp.estimation_covariance()
     ocp.subject_to(E[x, x], upper=0.12, name="knowledge")
     ocp.minimize(running=w**2)
-    with pytest.raises(co.SolveError, match="knowledge is 0.2 at the start, .* at most 0.12") as caught:
+    with pytest.raises(co.SolveError, match=r"knowledge is 0\.2 at the start, .* at most 0\.12") as caught:
         co.solve(ocp, progress=False)
     assert "covariances=" not in str(caught.value)

@@ -53,9 +53,10 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
     noise = impossible_noises([outcome.extremal], outcome.message)
     given = _passed_at_the_start(outcome)
+    other_way = "" if given else other_way
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
-        f"{violated}{given}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{'' if given else other_way}"
+        f"{violated}{given}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{other_way}"
         "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
         solution=solution,
         violations=violations,
