@@ -99,7 +99,7 @@ def test_no_nonsense_leads_to_a_crash_or_a_control_that_is_no_number(name, tmp_p
     sizes = {port.name: port.size for port in (*law.inputs, *law.outputs)}
     text = PROGRAM.format(
         name=name,
-        rounds=20_000 if name.endswith("sampled") else 3_000,  # steps of these go from node to node
+        rounds=6_000 if name.endswith("sampled") else 3_000,  # of these the last status is the rarest: one step in 1000
         rows=sizes["measurement"],
         controls=sizes["control"],
         spoilt=spoilt(law),
@@ -109,7 +109,7 @@ def test_no_nonsense_leads_to_a_crash_or_a_control_that_is_no_number(name, tmp_p
     )
     (tmp_path / "main.c").write_text(text)
     sources = [tmp_path / "main.c", made.directory / f"{name}.c", made.directory / f"{name}_casadi.c"]
-    effort = "-O1" if name.endswith("sampled") else "-O0"  # those that run long; the others compile long
+    effort = "-Og" if name.startswith("mars") or name.endswith("sampled") else "-O0"  # those that run long
     command = ["cc", "-std=c99", effort, *SANITIZE, f"-I{made.directory}", *sources, "-lm", "-o", tmp_path / "main"]
     built = subprocess.run(command, capture_output=True, text=True)
     if built.returncode and "sanitize" in built.stderr:
