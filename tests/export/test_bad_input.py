@@ -61,7 +61,7 @@ int main(void)
     return 0;
 }}
 """
-SANITIZE = ["-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+SANITIZE = ["-g1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 # Needs the header and the object code of any package.
 APP = """\
 #include "{name}.h"
@@ -226,7 +226,8 @@ def test_the_lines_of_the_readme_for_cmake_make_a_program(name, tmp_path):
     (tmp_path / "CMakeLists.txt").write_text(re.findall(r"```cmake\n(.*?)```", text, re.DOTALL)[0])
     (tmp_path / "app.c").write_text(app(name))
     shutil.copytree(package(name).directory, tmp_path / name, ignore=shutil.ignore_patterns("build"))
-    command = "cmake -S . -B build && cmake --build build --target app"
+    quick = "" if name == "lag" else "-DCMAKE_BUILD_TYPE=Debug"  # as the package asks where nothing is said: optimised
+    command = f"cmake -S . -B build {quick} && cmake --build build --target app"
     done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     made = subprocess.run([tmp_path / "build" / "app"], capture_output=True, text=True)

@@ -24,7 +24,7 @@ ALLOCATION = {
     "sbrk",
 }
 OUTPUT = {"printf", "puts", "putchar", "fprintf", "fwrite", "exit", "abort"}
-SANITIZE = ["-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
+SANITIZE = ["-g1", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
 
 
 def undefined_symbols(name):
