@@ -7,7 +7,7 @@ import subprocess
 import casadi as ca
 import numpy as np
 import pytest
-from exports import package
+from exports import SANITIZE, package, sanitized
 
 import covocp as co
 from covocp.export import export_c
@@ -61,7 +61,6 @@ int main(void)
     return 0;
 }}
 """
-SANITIZE = ["-g1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 # Needs the header and the object code of any package.
 APP = """\
 #include "{name}.h"
@@ -108,13 +107,10 @@ def test_no_nonsense_leads_to_a_crash_or_a_control_that_is_no_number(name, tmp_p
         measurement="measurement" if sizes["measurement"] > 1 else "measurement[0]",
     )
     (tmp_path / "main.c").write_text(text)
-    sources = [tmp_path / "main.c", made.directory / f"{name}.c", made.directory / f"{name}_casadi.c"]
-    effort = "-Og" if name.startswith("mars") or name.endswith("sampled") else "-O0"  # those that run long
-    command = ["cc", "-std=c99", effort, *SANITIZE, f"-I{made.directory}", *sources, "-lm", "-o", tmp_path / "main"]
-    built = subprocess.run(command, capture_output=True, text=True)
-    if built.returncode and "sanitize" in built.stderr:
+    if not sanitized(name):
         pytest.skip("the compiler has no sanitizers")
-    assert built.returncode == 0, built.stderr
+    command = ["cc", "-std=c99", *SANITIZE, f"-I{made.directory}", tmp_path / "main.c", *sanitized(name), "-lm"]
+    subprocess.run([*command, "-o", tmp_path / "main"], check=True, capture_output=True)
     done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert all(int(count) > 0 for count in done.stdout.split())  # every status was seen
