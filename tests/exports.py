@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import shutil
+import subprocess
 import tempfile
 import warnings
 from functools import lru_cache
@@ -23,6 +24,7 @@ atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 STRICT = ["-Werror"]
 # Numbers do not depend on what a compiler makes faster, which takes it four times as long.
 QUICK = [*STRICT, "-O0"]
+SANITIZE = ["-g1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 PLANNER = {"intervals": 12, "substeps": 2}  # substeps="auto" depends on the parameters
 STEP = 0.1
 TRANSITION = np.array([[1.0, STEP], [0.0, 1.0]])
@@ -131,3 +133,20 @@ def package(name: str) -> CPackage:
         made = makers[name](FOLDER / name)
     made.build(flags=STRICT)
     return made
+
+
+@lru_cache
+def sanitized(name: str) -> tuple[Path, ...]:
+    """Object code of a package under the sanitizers; none where the compiler has no sanitizers."""
+    made, objects = package(name), []
+    effort = "-Og" if name.startswith("mars") or name.endswith("sampled") else "-O0"  # those that run long
+    for stem in (name, f"{name}_casadi"):
+        objects.append(FOLDER / f"{name}_sanitized_{stem}.o")
+        command = ["cc", "-std=c99", effort, *SANITIZE, "-fno-omit-frame-pointer", "-c"]
+        built = subprocess.run(
+            [*command, made.directory / f"{stem}.c", "-o", objects[-1]], capture_output=True, text=True
+        )
+        if built.returncode and "sanitize" in built.stderr:
+            return ()
+        assert built.returncode == 0, built.stderr
+    return tuple(objects)

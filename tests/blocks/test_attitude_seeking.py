@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from attitude_programs import Case
 from compiled import compile_function
+from exports import QUICK
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -321,7 +322,7 @@ def test_the_functions_copy_and_nest():
 def test_exported_laws_agree_with_python(name, tmp_path):
     law = LAWS[name](window=4)
     package = co.export_c([law.read, law.update, law.step], tmp_path / "law")
-    package.build()
+    package.build(flags=QUICK)
     assert package.check().ok
     assert "alloc(" not in (tmp_path / "law" / "law.c").read_text(encoding="utf-8")
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pickle
+from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
 from compiled import compile_function
+from exports import QUICK
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_systems import FIXED, SEEDS
@@ -157,13 +159,14 @@ def test_it_is_as_certain_as_it_says_and_the_printed_filter_is_not(inputs):
 @pytest.mark.parametrize("inputs", [1, 2, 3, 4, 6])
 def test_modified_step_is_that_of_the_eigenvalues(inputs):
     """Against LAPACK: curvatures by size, at least the smallest, and no longer than allowed."""
+    given = USUAL | {"smallest_curvature": 0.3, "largest_step": 0.7}
+    laws = [peak_seeking.seeker(inputs, 30, maximum=up, **given) for up in (False, True)]
     for seed in range(20 if inputs < 4 else 5):
         M, b, _ = random_quadratic(seed, inputs)
-        given = USUAL | {"smallest_curvature": 0.3, "largest_step": 0.7}
-        for maximum in (False, True):
-            law = peak_seeking.seeker(inputs, 30, prior=packed(M, b), maximum=maximum, **given)
+        for law, maximum in zip(laws, (False, True), strict=True):
             memory = law.initial()
-            memory[law.layout.readings] = 2  # as after an update that found what the prior says
+            memory[law.layout.parameters] = packed(M, b)
+            memory[law.layout.readings] = 30  # as after updates that found this
             values, vectors = np.linalg.eigh(M)
             expected = -vectors @ ((vectors.T @ b) / np.maximum(np.abs(values), 0.3)) * (-1.0 if maximum else 1.0)
             expected *= min(1.0, 0.7 / np.linalg.norm(expected))
@@ -306,13 +309,19 @@ READING = st.tuples(
 )
 
 
+@cache
+def sharp(reuse):
+    """A seeker that takes its readings for nearly exact."""
+    return peak_seeking.seeker(
+        2, 4, noise=1e-6, drift=1e-8, prior_covariance=25.0, prior=np.zeros(5), reuse=reuse, **STEP
+    )
+
+
 @settings(max_examples=150, deadline=None)
 @given(readings=st.lists(READING, max_size=20), single=st.booleans(), reuse=st.booleans())
 def test_covariance_is_semidefinite_whatever_comes(readings, single, reuse):
     """Repeated positions, huge steps, gaps, arrays of float32: finite and positive semidefinite."""
-    law = peak_seeking.seeker(
-        2, 4, noise=1e-6, drift=1e-8, prior_covariance=25.0, prior=np.zeros(5), reuse=reuse, **STEP
-    )
+    law = sharp(reuse)
     memory = law.initial()
     for position, value in readings:
         at = np.array(position, dtype=np.float32 if single else float)
@@ -406,7 +415,7 @@ def test_the_functions_are_casadi_functions_that_copy_and_nest():
 def test_exported_functions_agree_with_python(inputs, tmp_path):
     law = peak_seeking.seeker(inputs, 15, **USUAL)
     package = co.export_c([law.update, law.step], tmp_path / "seeker")
-    package.build()
+    package.build(flags=QUICK)
     assert package.check().ok
     for name in ("seeker.c", "seeker_casadi.c"):
         assert "alloc(" not in (tmp_path / "seeker" / name).read_text(encoding="utf-8")

@@ -23,20 +23,20 @@ START = so3.principal(2, np.radians(60.0)) @ so3.principal(3, np.radians(20.0))
 
 
 @cache
-def reduction_function(rows, kappa, penalty, largest_step, curvature):
-    """The reduction of so many rows as a function of estimate, covariance, A and beta."""
+def reduction_function(rows, curvature):
+    """The reduction of so many rows as a function of estimate, covariance, A, beta, kappa, penalty and largest step."""
     symbols = ca.SX.sym("b", 3), ca.SX.sym("P", 3, 3), ca.SX.sym("A", rows, 3), ca.SX.sym("beta", rows)
     b, P, A, beta = symbols
-    options = {"kappa": kappa, "penalty": penalty, "largest_step": largest_step, "curvature": curvature}
-    return ca.Function("reduction", list(symbols), list(reduced(b, P, Rows(A, beta), **options)))
+    options = {name: ca.SX.sym(name) for name in ("kappa", "penalty", "largest_step")}
+    found = reduced(b, P, Rows(A, beta), **options, curvature=curvature)
+    return ca.Function("reduction", [*symbols, *options.values()], list(found))
 
 
 def reduction(case, *, curvature=False):
     """b, lambda, mu, zeta of a case."""
-    numbers = (float(value) for value in (case.kappa, case.penalty, case.largest_step))
-    function = reduction_function(len(case.beta), *numbers, curvature)
-    found = function.call([ca.DM(v) for v in (case.estimate, case.covariance, case.A, case.beta)])
-    return [np.ravel(part.full()) for part in found]
+    function = reduction_function(len(case.beta), curvature)
+    numbers = (case.estimate, case.covariance, case.A, case.beta, case.kappa, case.penalty, case.largest_step)
+    return [np.ravel(part.full()) for part in function.call([ca.DM(v) for v in numbers])]
 
 
 def cost(case, b, zeta):

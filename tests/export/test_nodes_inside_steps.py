@@ -160,7 +160,8 @@ def test_a_short_phase_after_a_long_one_comes_to_its_end(
         ocp.minimize_expected(running=u**2 / first, terminal_weight={x: 1.0} if name == "two" else None)
         return ocp
 
-    solution = co.solve(co.Phases([phase(first, "one"), phase(last, "two")]), intervals=[20, 20], progress=False)
+    phases, nominal = co.Phases([phase(first, "one"), phase(last, "two")]), {"u": lambda s: 0.3 - 0.2 * s}
+    solution = co.evaluate(phases, nominal=[nominal, nominal], intervals=[20, 20])
     made = export_c(solution, tmp_path / "pair", precision=precision)
     made.build(flags=QUICK)
     (tmp_path / "fly.c").write_text(

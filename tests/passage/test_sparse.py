@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
-from longer import in_long_double
+from longer import in_long_double, passed_in_long_double
 from scipy.integrate import solve_ivp
 
 from covocp.base.matrices import half_length, pack, unpack
@@ -15,6 +17,7 @@ from covocp.passage.sweep import _Sweep, entries_of, passed_by
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
 STEPS = 5
+ROWS, COUNT, EVERY = 10, 20, 2  # of the steps of which slopes of few entries are taken: in an interval two
 KEPT: list[_Sweep] = []
 
 
@@ -152,33 +155,34 @@ def oscillators(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.hstack([h * H for h in lengths]), np.hstack([1.01 * h * H for h in lengths])
 
 
-def by_stages(
-    first: np.ndarray, points: tuple[np.ndarray, np.ndarray], seeds: np.ndarray, ends: int
-) -> list[np.ndarray]:
-    """Slopes by both points along a direction of the form of H, and it: differences of steps in longer arithmetic."""
-    n, slopes = len(first), []
-    every = points[0].shape[1] // (2 * n * ends)
+def few_entries(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """h H at both points of the steps of which slopes of few entries are taken."""
+    if kind == "poor pivots":
+        return oscillators(COUNT)
+    F, Q, W = chain(ROWS, damping=30.0 if kind == "strongly damped" else 0.3)
+    H = 0.2 * np.block([[-F.T, W * (1e5 if kind == "much measured" else 1.0)], [Q, F]])
+    return np.tile(H, COUNT), np.tile(1.01 * H, COUNT)
 
-    def value(given: list[np.ndarray]) -> np.longdouble:
-        total, E = np.longdouble(0.0), first
-        for e in range(ends):
-            span = slice(2 * n * every * e, 2 * n * every * (e + 1))
-            E = in_long_double(E, given[0][:, span], given[1][:, span], steps=every)
-            lower = np.concatenate([E[j:, j] for j in range(n)])
-            total += (seeds[:, e] * lower).sum()
-        return total
 
+@cache
+def by_stages(kind: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each point: a direction of the form of H, and how the covariances of all intervals move along it.
+
+    By differences of steps in longer arithmetic; lower halves, one column an interval.
+    """
+    points, slopes = few_entries(kind), []
     for k in range(2):
-        rng, moves = np.random.default_rng(k), points[k].shape[1] // (2 * n)
-        F, Q, W = (rng.normal(size=(moves, n, n)) for _ in range(3))
+        rng = np.random.default_rng(k)
+        F, Q, W = (rng.normal(size=(COUNT, ROWS, ROWS)) for _ in range(3))
         Q, W = Q + Q.transpose(0, 2, 1), W + W.transpose(0, 2, 1)
         direction = np.hstack(np.block([[-F.transpose(0, 2, 1), W], [Q, F]])) * (points[k] != 0)
         step, moved = np.longdouble(1e-8), []
         for sign in (1, -1):
             given = [p.astype(np.longdouble) for p in points]
             given[k] = given[k] + sign * step * direction
-            moved.append(value(given))
-        slopes.append(np.array([float((moved[0] - moved[1]) / (2 * step)), *direction.ravel()]))
+            passed = passed_in_long_double(prior(ROWS), *given, steps=COUNT)[EVERY - 1 :: EVERY]
+            moved.append(np.array([np.concatenate([E[j:, j] for j in range(ROWS)]) for E in passed]).T)
+        slopes.append((direction, (moved[0] - moved[1]) / (2 * step)))
     return slopes
 
 
@@ -190,13 +194,7 @@ def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows, most):
     """Of factors alone, or of what is wanted; then all stages are asked for, and are there from then on."""
     monkeypatch.setattr(ordering, "LARGEST_SHARE", 1e9)
     monkeypatch.setattr(sweep, "MOST_FACTORS", most)
-    n, count, every = 10, 20, 2
-    if kind == "poor pivots":
-        both = oscillators(count)
-    else:
-        F, Q, W = chain(n, damping=30.0 if kind == "strongly damped" else 0.3)
-        H = 0.2 * np.block([[-F.T, W * (1e5 if kind == "much measured" else 1.0)], [Q, F]])
-        both = np.tile(H, count), np.tile(1.01 * H, count)
+    n, count, every, both = ROWS, COUNT, EVERY, few_entries(kind)
     pattern = ca.sparsify(ca.DM(np.abs(both[0][:, : 2 * n]))).sparsity()
     wide = ca.repmat(pattern, 1, count)
     a = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
@@ -214,10 +212,9 @@ def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows, most):
     few[:, -3] = pack(C)  # what comes after has no slopes
     for seeds in (few, all_, few):
         _, _, *slopes = function(*given, seeds)
-        for own_slope, known, moves in zip(slopes, by_stages(E, both, seeds, count // every), both, strict=True):
-            found = float(np.sum(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape)))
-            size = float(np.sum(np.abs(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape))))
-            assert abs(found - known[0]) <= 1e-8 * size
+        for own_slope, (direction, moved) in zip(slopes, by_stages(kind), strict=True):
+            along = np.asarray(own_slope.full()) * direction
+            assert abs(np.sum(along) - (seeds * moved).sum()) <= 1e-8 * np.sum(np.abs(along))
 
 
 @pytest.mark.parametrize("reads", [(), (5, 6, 23)])
