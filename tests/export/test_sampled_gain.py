@@ -95,14 +95,14 @@ def test_the_gain_after_init_is_the_one_that_is_flown():
 
 
 def test_spread_as_flown_is_that_of_the_compiled_law_in_the_actual_system(steep_end):
-    samples = tables(steep_end, 0.2)
+    samples = tables(steep_end, 0.1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", co.CovocpWarning)  # what a fifth of a second loses
-        package = co.export_c(steep_end, FOLDER / "steep_fifth", period=0.2)
+        warnings.simplefilter("ignore", co.CovocpWarning)  # what a tenth of a second loses
+        package = co.export_c(steep_end, FOLDER / "steep_tenth", period=0.1)
     assert package.check().ok
-    runs = co.simulate(steep_end, 250, seed=4, law=package.python(), progress=False)
+    runs = co.simulate(steep_end, 500, seed=4, law=package.python(), progress=False)
     predicted = np.sqrt(np.diagonal(samples.flown[-1]))
-    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 250))
+    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 500))
 
 
 def test_a_sampled_loop_promises_what_it_holds(steep_end):
