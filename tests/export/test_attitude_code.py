@@ -85,7 +85,7 @@ def test_a_quaternion_of_length_zero_is_no_attitude() -> None:
 
 def test_a_free_attitude_is_chosen_by_each_plan() -> None:
     """Nothing turns it: it stays where the goal is."""
-    made = export_c(attitudes.slew(None, GOAL)[0], FOLDER / "turned_free", **FEW)
+    made = export_c(attitudes.slew(None, GOAL)[0], FOLDER / "turned_free", **MESHES["slew"])
     assert [port.name for port in made.laws[0].arguments] == ["initial_omega", "duration", "guess"]
     plan = made.reference()()
     assert plan["status"] == "OK"
@@ -102,7 +102,7 @@ def test_units_are_those_of_quaternions_and_of_rotation_vectors() -> None:
     ocp.measurement("star", attitude.matrix[:, 0], 0.01)
     ocp.minimize_expected(running=0.5 * ca.sumsqr(torque), terminal_weight={omega: 1.0, attitude: 2.0})
     made = export_c(co.solve(ocp, intervals=6, progress=False), FOLDER / "pointed")
-    planned = export_c(attitudes.slew(np.eye(3), GOAL)[0], FOLDER / "pointed_plan", **FEW)
+    planned = export_c(attitudes.slew(np.eye(3), GOAL)[0], FOLDER / "pointed_plan", **MESHES["slew"])
     rates = [f"omega[{i}] [rad/s]" for i in range(3)]
     ports = {port.name: port for law in made.laws for port in law.outputs}
     assert ports["estimate"].entries == (*rates, "att[0] [rad]", "att[1] [rad]", "att[2] [rad]")
