@@ -30,6 +30,8 @@ AT_START, REACHED = 1e-3, 1e-9
 # point that was reached: a large prior says that little is known, not that the nominal goes there. In far too large
 # units of state and control a cost has the size of what they change of it, and any point looks converged.
 PRIOR_AT_START, PRIOR_REACHED = 1e3, 10.0
+# Share of the largest magnitude of the states that one which nothing tells may have in a bend of the controls.
+UNTOLD_SHARE = 0.1
 # Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
 GIVEN_SHARE = 1e-6
 # Half the range of bounds counts up to so many times what else tells of a state that may have vanished.
@@ -61,7 +63,7 @@ def magnitudes(
         parameters: of the statement.
         reached: whether a solver found it: then it tells more than scales that were given.
         far: so many times what the measurements resolve.
-        untold_far: whether a state of which nothing tells a magnitude may go as far as the others; else it has 1.
+        untold_far: whether a state of which nothing tells a magnitude has at least a share of the largest; else 1.
     """
     lower, upper = statement.state_bounds
     ends, deviations = _prescribed(statement, parameters, PRIOR_REACHED if reached else PRIOR_AT_START)
@@ -79,7 +81,7 @@ def magnitudes(
     least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
     x = np.where(found > NOTHING, np.clip(found, least, span), alone)
     if untold_far:
-        known = max((found[k] for k in statement.moving), default=0.0)
+        known = UNTOLD_SHARE * max((found[k] for k in statement.moving), default=0.0)
         x = np.where(found > NOTHING, x, np.minimum(np.maximum(x, known), span))
     u = np.ones(statement.nu)
     for block in statement.states:
