@@ -55,3 +55,22 @@ def test_a_limit_of_iterations_holds_for_all_durations():
     solution = co.Solver(to_rest(2.0, -2.02, 2.0)).solve(iteration_limit=12, progress=False)
     assert not solution.converged
     assert solution.stats["iterations"] <= 13
+
+
+@pytest.mark.parametrize("guess", [0.5, 1.0])
+def test_phases_whose_durations_are_guessed_too_short_are_longer(guess):
+    """Past a gate at 1 on the way to the turn at -0.04, or on a second way, which takes 6.06 s."""
+    first, second = (co.Problem(co.Free(guess, 0.01, 60.0), name=name) for name in ("first", "second"))
+    for problem, starts, end in ((first, (2.0, -2.02), (1.0, None)), (second, (None, None), (0.0, 0.0))):
+        x, v = (
+            problem.state(name, initial=begin, final=at)
+            for name, begin, at in zip(("x", "v"), starts, end, strict=True)
+        )
+        u = problem.control("u", lower=-1.0, upper=1.0)
+        problem.dynamics(x, v)
+        problem.dynamics(v, u)
+        problem.minimize(terminal=problem.duration)
+    solution = co.solve(co.Phases([first, second]), progress=False)
+    assert least_time(2.0, -2.02) * (1 - 1e-3) <= solution.cost <= 6.07
+    assert solution.phases[1]["x"][-1] == pytest.approx(0.0, abs=1e-6)
+    assert solution.phases[1]["v"][-1] == pytest.approx(0.0, abs=1e-6)

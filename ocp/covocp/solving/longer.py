@@ -47,20 +47,23 @@ def from_longer(
     if outcome.converged or not outcome.violations or not statement.duration.free:
         return failed
     named, tried = guess if isinstance(guess, Mapping) else {}, outcome
-    for duration in longer(replace(statement.duration, guess=start.trajectory.duration)):
+    begun = replace(statement, duration=replace(statement.duration, guess=start.trajectory.duration))
+    for duration in longer(begun.duration):
         if reporter.stop:
             break
-        further = replace(statement, duration=replace(statement.duration, guess=duration))
+        further = replace(begun, duration=replace(begun.duration, guess=duration))
         try:
-            again, begun = from_starts(prepared, values, make_guesses(further, prepared.mesh, values, named), reporter)
+            again, at = from_starts(prepared, values, make_guesses(further, prepared.mesh, values, named), reporter)
         except ProblemError:  # the model has no values there
             continue
         tried = with_stats(again, **counted(tried, again))
         if again.converged:
-            return tried, begun
+            return tried, at
     return with_stats(outcome, **{name: tried.stats[name] for name in counted(outcome, tried)}), start
 
 
 def longer(duration: Duration) -> list[float]:
-    """Longer ones than the guess, up to the bound [s]."""
+    """Longer ones than the guess, up to the bound [s]; none where it is not free."""
+    if not duration.free:
+        return []
     return sorted({min(factor * duration.guess, duration.upper) for factor in LONGER} - {duration.guess})

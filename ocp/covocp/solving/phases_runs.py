@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice, product
@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.dataclass import dataclass
-from covocp.base.errors import CovocpError, OutsideDomainError
+from covocp.base.errors import CovocpError, OutsideDomainError, ProblemError
 from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -21,6 +21,7 @@ from covocp.extremal.extremal import Guess, Merit
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.solving.attempts import NO_MERIT, TRIED, best_of, counted, worth_a_run
+from covocp.solving.longer import longer
 from covocp.solving.other_minima import TURNS, unless_it_fails
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
@@ -212,10 +213,30 @@ class ChainRuns:
             better = again.converged and (not outcome.converged or again.cost < outcome.cost)
             found = again if better else outcome
             outcome = replace(found, stats={**found.stats, **counted(outcome, again)})
+        outcome = self._from_longer(begun, prepared, outcome)
         told = {"tried": tried} if tried > 1 else {}
         if left and outcome.converged:
             told["untried"] = left
         return replace(outcome, stats={**outcome.stats, **told})
+
+    def _from_longer(self, begun: Begun, prepared: Any, failed: ChainOutcome) -> ChainOutcome:
+        """Solved from longer durations where a run has failed with conditions that are not met; else as it failed."""
+        guessed = [[st.duration.guess, *longer(st.duration)] for st in self._chain.statements]
+        if failed.converged or not failed.violations or any(guess.warm for guess in begun.guesses):
+            return failed
+        tried = failed
+        for k in range(1, max(map(len, guessed))):
+            if self._reporter.stop:
+                break
+            try:
+                start = self._begun(begun.options, durations=[own[min(k, len(own) - 1)] for own in guessed])
+                again: ChainOutcome = prepared.solve(begun.values, start.guesses, self._reporter)
+            except ProblemError:  # a model has no values there
+                continue
+            tried = replace(again, stats={**again.stats, **counted(tried, again)})
+            if again.converged:
+                return tried
+        return replace(failed, stats={**failed.stats, **{name: tried.stats[name] for name in counted(failed, tried)}})
 
     def _sides(self, begun: Begun) -> list[Guesses]:
         """The start, and those whose phases are bent to other sides, that are worth a run beside it."""
@@ -271,15 +292,23 @@ class ChainRuns:
             return None
         return None if found is None else found.guesses
 
-    def _begun(self, options: tuple[Options, ...], attempt: int = 0, turned: set[int] | None = None) -> Begun:
+    def _begun(
+        self,
+        options: tuple[Options, ...],
+        attempt: int = 0,
+        turned: set[int] | None = None,
+        durations: Sequence[float] = (),
+    ) -> Begun:
         """A guess for each phase, each of which starts where the one before it ends.
 
         The parameters have the matrices that a phase then starts with, and the weights that the next one has where it
         begins; the options are graded for them. `turned`: the phases that are bent to the other side; then their merit
-        is asked for, along starts as they are to be compared.
+        is asked for, along starts as they are to be compared. `durations`: to begin with in place of what is guessed.
         """
 
         def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess:
+            if durations:
+                st = replace(st, duration=replace(st.duration, guess=durations[i]))
             guesses = first_guesses(own, st, mesh, value, self._guesses[i], linked=True)
             guess = list(islice(guesses, attempt + 1))[-1]
             if turned is None:
