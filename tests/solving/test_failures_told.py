@@ -202,3 +202,17 @@ def test_a_covariance_that_begins_above_its_limit_is_told_and_no_other_way():
     with pytest.raises(co.SolveError, match=r"knowledge is 0\.2 at the start, .* at most 0\.12") as caught:
         co.solve(ocp, progress=False)
     assert "covariances=" not in str(caught.value)
+
+
+@pytest.mark.parametrize("row", ["lesser", "chosen", "rate"])
+def test_what_controls_or_the_duration_may_still_change_is_not_given(row):
+    ocp = co.Problem(co.Free(1.0, 0.1, 60.0))
+    x, u = ocp.state("x", initial=1.0, final=1.0), ocp.control("u", lower=-2.0, upper=2.0)
+    ocp.dynamics(x, u)
+    rows = {"lesser": ca.fmin(x, u), "chosen": ca.if_else(u > 0, 0.0 * x, x), "rate": x / ocp.duration}
+    ocp.subject_to(rows[row], upper=0.5, name=row)
+    ocp.subject_to(x, upper=-1.0, at="final", name="end")
+    ocp.minimize(terminal=ocp.duration)
+    with pytest.raises(co.SolveError) as caught:
+        co.solve(ocp, progress=False)
+    assert "at the start, by what is given there" not in str(caught.value)

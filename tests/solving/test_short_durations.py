@@ -7,13 +7,15 @@ import covocp as co
 from covocp import SolveError
 
 
-def to_rest(position, speed, guess, *, spring=0.0, upper=60.0):
+def to_rest(position, speed, guess, *, spring=0.0, upper=60.0, slowest=None):
     """Least time to rest at zero with |u| <= 1."""
     ocp = co.Problem(co.Free(guess, 0.01, upper))
     x, v = ocp.state("x", initial=position, final=0.0), ocp.state("v", initial=speed, final=0.0)
     u = ocp.control("u", lower=-1.0, upper=1.0)
     ocp.dynamics(x, v)
     ocp.dynamics(v, u - spring * x)
+    if slowest is not None:
+        ocp.subject_to(v, lower=slowest, name="speed")
     ocp.minimize(terminal=ocp.duration)
     return ocp
 
@@ -51,10 +53,24 @@ def test_iterations_count_those_of_all_durations():
     assert early.stats["iterations"] > late.stats["iterations"]
 
 
-def test_a_limit_of_iterations_holds_for_all_durations():
-    solution = co.Solver(to_rest(2.0, -2.02, 2.0)).solve(iteration_limit=12, progress=False)
+def test_limits_are_those_of_one_run():
+    solver = co.Solver(to_rest(2.0, -2.02, 2.0))
+    solution = solver.solve(iteration_limit=12, progress=False)
     assert not solution.converged
     assert solution.stats["iterations"] <= 13
+    with pytest.raises(SolveError, match="contradict"):  # known before the limit: it is not used up in vain
+        solver.solve(iteration_limit=900, progress=False)
+    with pytest.raises(SolveError) as caught:
+        co.solve(to_rest(2.0, -2.02, 2.0), max_iterations=5, progress=False)
+    assert caught.value.solution.stats["iterations"] <= 5
+
+
+def test_a_limit_that_the_start_passes_is_told_after_one_run():
+    ocp = to_rest(2.0, -2.02, 2.0, slowest=-2.0)
+    with pytest.raises(SolveError, match=r"speed is -2\.02 at the start") as caught:
+        co.solve(ocp, progress=False)
+    once = co.Solver(ocp).solve(allow_failure=True, iteration_limit=2000, progress=False)
+    assert caught.value.solution.stats["iterations"] == once.stats["iterations"]
 
 
 @pytest.mark.parametrize("guess", [0.5, 1.0])

@@ -88,13 +88,13 @@ def _sides(prepared: Prepared, values: Array, own: Guess) -> list[Guess]:
     if sides is own.sides:
         return [replace(led, rival=False)]
     first, *mirrored = own.sides
-    alone = _merit(prepared, values, own.trajectory)  # first: its magnitudes are those of the program
-    alone = alone if first is own.trajectory else _merit(prepared, values, first)
-    merits = [(_merit(prepared, values, t), Guess(trajectory=t, alike=True, rival=True)) for t in mirrored]
+    alone = merit_of(prepared, values, own.trajectory)  # first: its magnitudes are those of the program
+    alone = alone if first is own.trajectory else merit_of(prepared, values, first)
+    merits = [(merit_of(prepared, values, t), Guess(trajectory=t, alike=True, rival=True)) for t in mirrored]
     return [replace(own, alike=True), *worth_a_run(alone, merits)]
 
 
-def _merit(prepared: Prepared, values: Array, trajectory: Trajectory) -> Merit:
+def merit_of(prepared: Prepared, values: Array, trajectory: Trajectory) -> Merit:
     """Of a trajectory; NaN where the model has no values along it: what runs from there says so."""
     try:
         return prepared.merit(values, trajectory)
@@ -202,7 +202,7 @@ class _Runs:
             return False
         best = min(found, key=cost_of)
         end, begins = best.extremal.trajectory, rival.trajectory
-        merits = [_merit(self.prepared, self.values, between(begins, end, share)) for share in ALONG]
+        merits = [merit_of(self.prepared, self.values, between(begins, end, share)) for share in ALONG]
         costs = [*(merit.cost for merit in merits), cost_of(best)]
         met = max(merit.violation for merit in merits) <= LITTLE
         return bool(met and np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())

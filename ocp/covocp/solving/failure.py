@@ -52,7 +52,7 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     lines = [f"  {row}: {value:.6g}" for row, value in stated_first(violations)[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
     noise = impossible_noises([outcome.extremal], outcome.message)
-    given = _passed_at_the_start(outcome)
+    given = passed_at_the_start(outcome)
     other_way = "" if given else other_way
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
@@ -63,15 +63,22 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     )
 
 
-def _passed_at_the_start(outcome: Outcome) -> str:
+def passed_at_the_start(outcome: Outcome) -> str:
     """A line for each limit along the path that what is given at the start passes, whatever the controls are."""
     st, p = outcome.extremal.statement, outcome.extremal.parameters
     x0, _, e0, _ = st.boundary_values(p)
-    # what is not given is no number, nor is then what depends on it
-    known = st.path.function(x0, np.full(st.nu, np.nan), e0, 0.0, outcome.extremal.trajectory.duration, p)
-    values = np.asarray(ca.DM(known).full()).ravel()
-    lines = []
-    for name, value, low, high in zip(st.path.names, values, st.path.lower, st.path.upper, strict=True):
+    function, t = st.path.function, outcome.extremal.trajectory
+    chosen = {0: np.isnan(x0), 1: np.ones(st.nu, bool), 2: np.isnan(e0), 4: np.array([st.duration.free])}
+    given = np.ones(st.path.size, bool)
+    for place, free in chosen.items():
+        rows, columns = function.jac_sparsity(0, place).get_triplet()
+        given[[row for row, column in zip(rows, columns, strict=True) if free[column]]] = False
+    if not given.any():
+        return ""
+    known = function(np.nan_to_num(x0), t.u[0], np.nan_to_num(e0), 0.0, t.duration, p)
+    values, lines = np.asarray(ca.DM(known).full()).ravel(), []
+    for k in np.flatnonzero(given).tolist():
+        name, value, low, high = st.path.names[k], values[k], st.path.lower[k], st.path.upper[k]
         excess = max(low - value, value - high)
         if name in outcome.violations and excess > GIVEN * max(abs(value), outcome.violations[name]):
             side = f"at most {high:.6g}" if value > high else f"at least {low:.6g}"

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.errors import CovocpError
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.solvers.plugins import merged
-from covocp.solving.attempts import counted, from_starts, with_stats
+from covocp.solving.attempts import counted, from_starts, merit_of, with_stats
+from covocp.solving.failure import with_stalled
 
 # Largest violation, in units of its row, from which on a run has gone away; and shares of the usual largest violation
 # that the steps of others may end at: the filter of Ipopt refuses more.
@@ -30,7 +32,7 @@ def kept_near(
     reporter: Progress,
     own: Mapping[str, Any],
 ) -> tuple[Outcome, Prepared]:
-    """Solve again with less room for violations where a run has ended far from what it must meet.
+    """Solve again with less room for violations where a run without limits has ended far from what it must meet.
 
     Args:
         ready: makes the program with other options of Ipopt.
@@ -44,15 +46,19 @@ def kept_near(
         The outcome that converged and what ran, with the iterations of all; else what was given.
     """
     options, values = own.get("plugin_options") or {}, failed.extremal.parameters
-    if failed.converged or reporter.stop or not failed.violations or "theta_max_fact" in options.get("ipopt", {}):
+    limited = reporter.limited or reporter.stop or "theta_max_fact" in options.get("ipopt", {})
+    if failed.converged or limited or not failed.violations:
         return failed, prepared
-    violation = prepared.merit(values, failed.extremal.trajectory).violation
+    violation = merit_of(prepared, values, failed.extremal.trajectory).violation
     if np.isfinite(violation) and violation < AWAY:
         return failed, prepared
-    tried = failed
+    failed = tried = with_stalled(failed, reporter)  # of the iterations of this run, not of all together
     for share in NEAR:
         near = ready(plugin_options=merged(options, {"ipopt": {"theta_max_fact": share}}))
-        again, _ = from_starts(near, values, guesses(), reporter)
+        try:
+            again, _ = from_starts(near, values, guesses(), reporter)
+        except (CovocpError, RuntimeError):  # the model has no values there; CasADi's
+            continue
         tried = with_stats(again, **counted(tried, again))
         if again.converged:
             named = {"method": "ipopt"} if "method" in failed.stats else {}

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.dataclass import dataclass
-from covocp.base.errors import CovocpError, OutsideDomainError, ProblemError
+from covocp.base.errors import CovocpError, OutsideDomainError
 from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -21,7 +21,8 @@ from covocp.extremal.extremal import Guess, Merit
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.solving.attempts import NO_MERIT, TRIED, best_of, counted, worth_a_run
-from covocp.solving.longer import longer
+from covocp.solving.failure import with_stalled
+from covocp.solving.longer import longer, may_be_too_short
 from covocp.solving.other_minima import TURNS, unless_it_fails
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
@@ -222,16 +223,17 @@ class ChainRuns:
     def _from_longer(self, begun: Begun, prepared: Any, failed: ChainOutcome) -> ChainOutcome:
         """Solved from longer durations where a run has failed with conditions that are not met; else as it failed."""
         guessed = [[st.duration.guess, *longer(st.duration)] for st in self._chain.statements]
-        if failed.converged or not failed.violations or any(guess.warm for guess in begun.guesses):
+        warm = any(guess.warm for guess in begun.guesses) or "max_iterations" in self._own
+        if warm or not may_be_too_short(failed, self._reporter):
             return failed
-        tried = failed
+        failed = tried = with_stalled(failed, self._reporter)
         for k in range(1, max(map(len, guessed))):
             if self._reporter.stop:
                 break
             try:
                 start = self._begun(begun.options, durations=[own[min(k, len(own) - 1)] for own in guessed])
                 again: ChainOutcome = prepared.solve(begun.values, start.guesses, self._reporter)
-            except ProblemError:  # a model has no values there
+            except (CovocpError, RuntimeError):  # a model has no values there; CasADi's
                 continue
             tried = replace(again, stats={**again.stats, **counted(tried, again)})
             if again.converged:

@@ -134,7 +134,8 @@ class Solver(ClassicalRuns):
         self._solved = solved
         self._own = own
         self._by_ipopt = method in ("ipopt", "auto") and str(self._own.get("plugin", "ipopt")) == "ipopt"
-        self._otherwise = bool(self._best) and self._by_ipopt and "max_iterations" not in self._own
+        self._counted = "max_iterations" in own  # by the user: nothing is run again in vain
+        self._otherwise = bool(self._best) and self._by_ipopt and not self._counted
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
         whole = nominal == "combined" and self._by_ipopt and refine is None
@@ -307,11 +308,12 @@ class Solver(ClassicalRuns):
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
-        outcome, start = from_longer((outcome, start), self._prepared, self._solved, values, guess, reporter)
+        if not self._counted:
+            outcome, start = from_longer((outcome, start), self._prepared, self._solved, values, guess, reporter)
         ready, where = partial(self._ready, self._options), (values, reporter, start)
         outcome, prepared = in_larger_units(ready, self._prepared, outcome, *where, first=not self._ran)
         self._ran = True
-        if not outcome.converged and self._by_ipopt:
+        if not outcome.converged and self._by_ipopt and not self._counted:
             near, mesh = partial(self._ready, self._options, by="ipopt"), self._prepared.mesh
             guesses = partial(make_guesses, self._solved, mesh, values, guess)
             outcome, prepared = kept_near(near, prepared, outcome, guesses, reporter, self._own)
