@@ -3,8 +3,8 @@
 CasADi's own `map` works through the whole function for one column after the other. The compiled library does each
 operation on some columns at a time; where it was not built, or does not know an operation, one numpy operation does it
 on all columns. No operation mixes columns, and the number of columns is a multiple of `LANES`, so that each is treated
-by the same vector instructions: a column has the same bits whatever its neighbours are, but for the sign of NaN. Functions that are not scalar
-graphs (interpolation tables, linear solvers) go through `map`, with the same property.
+by the same vector instructions: a column has the same bits whatever its neighbours are, but for the sign of NaN.
+Functions that are not scalar graphs (interpolation tables, linear solvers) go through `map`, with the same property.
 """
 
 from __future__ import annotations
