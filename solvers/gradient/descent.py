@@ -116,10 +116,9 @@ def solve_step(
     places: dict[bytes, int] = {}
     for _ in range(ACTIVE_SET_PASSES):
         found = _equality_step(metric, slope, rows, target, np.where(state < 0, lower, upper), state)
-        change, ell, gram = found
-        if metric.learns and not (np.isfinite(change).all() and (np.diag(gram) >= 0.0).all()):
-            # what pairs that hardly differ have shown is lost in rounding: no longer positive definite
+        if found is None:
             return solve_step(metric.plain(), slope, rows, target, lower, upper, active)
+        change, ell, gram = found
         pressure = -(slope + metric @ change + rows.T @ ell)
         new = np.where(state == 0, np.where(change > upper, 1, np.where(change < lower, -1, 0)), 0)
         new = np.where((state > 0) & (pressure > 0), 1, np.where((state < 0) & (pressure < 0), -1, new))
@@ -131,16 +130,18 @@ def solve_step(
         begin = places.get(new.tobytes())
         if begin is not None:  # from here on the same sets come in turn: those of the last pass are known
             period, left = len(tried) - begin, ACTIVE_SET_PASSES - begin
-            found, state = tried[begin + (left - 1) % period][1], tried[begin + left % period][0]
+            (change, ell, gram), state = tried[begin + (left - 1) % period][1], tried[begin + left % period][0]
             break
-    change, ell, gram = found
     return Step(change=np.clip(change, lower, upper), ell=ell, active=state, gram=gram)
 
 
 def _equality_step(
     metric: Metric, slope: Array, rows: Array, target: Array, bounds: Array, state: Array
-) -> tuple[Array, Array, Array]:
-    """The step with the active entries at their bounds: change, l, I_kk."""
+) -> tuple[Array, Array, Array] | None:
+    """The step with the active entries at their bounds: change, l, I_kk; None where what the metric has learnt is lost.
+
+    Pairs that hardly differ leave a metric that is not positive definite, by rounding.
+    """
     free = np.flatnonzero(state == 0)
     change = np.where(state == 0, 0.0, bounds)
     if not free.size:
@@ -149,6 +150,8 @@ def _equality_step(
     right = np.column_stack([-(slope + held)[free], rows[:, free].T])
     solved = metric.inverse(free)(right)
     gram = rows[:, free] @ solved[:, 1:]
+    if metric.learns and not (np.isfinite(solved).all() and (np.diag(gram) >= 0.0).all()):
+        return None
     ell = solve_gram(gram, rows[:, free] @ solved[:, 0] - (target - rows @ change))
     change[free] = solved[:, 0] - solved[:, 1:] @ ell
     return change, ell, gram
@@ -199,4 +202,6 @@ def positive_definite(blocks: Array, scale: Array, unit: float, smallest: float)
 def solve_tangent(metric: Metric, slope: Array, rows: Array, active: Array) -> Array:
     """metric^-1 slope within the directions that change neither the conditions nor the active entries, (n,)."""
     zero = np.zeros(slope.size)
-    return _equality_step(metric, -slope, rows, np.zeros(rows.shape[0]), zero, active)[0]
+    given = (-slope, rows, np.zeros(rows.shape[0]), zero, active)
+    found = _equality_step(metric, *given)
+    return solve_tangent(metric.plain(), slope, rows, active) if found is None else found[0]

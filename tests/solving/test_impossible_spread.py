@@ -47,7 +47,7 @@ def test_a_limit_below_the_error_of_the_filter_is_refused_at_once(share):
 
 def test_a_lower_limit_says_nothing_of_the_filter():
     """Feedback can let the place scatter more than it is known."""
-    solution = co.Solver(regulator(2.0 * known(), lower=True), intervals=8).solve(assess=False, progress=False)
+    solution = co.solve(regulator(2.0 * known(), lower=True), intervals=8, progress=False)
     assert float(solution.covariance("x")[-1].item()) >= 2.0 * known() * (1 - 1e-6)
 
 

@@ -42,6 +42,12 @@ def test_a_swinging_mass_is_stopped_from_any_guess(guess):
     assert co.solve(problem, progress=False).cost == pytest.approx(far.cost, rel=1e-6)
 
 
+def test_a_curvature_that_rounding_has_lost_is_no_error_of_numpy():
+    """Of the gradient method from 3 s for 2 pi: its metric was not definite any more, and a step no number."""
+    solution = co.Solver(to_rest(4.0, 0.0, 3.0, spring=1.0), "gradient").solve(allow_failure=True, progress=False)
+    assert np.isfinite(solution["u"]).all()
+
+
 def test_a_bound_of_the_duration_is_kept_and_what_is_missing_is_told():
     with pytest.raises(SolveError, match="violated constraints") as caught:
         co.solve(to_rest(2.0, -2.02, 1.5, upper=2.2), progress=False)

@@ -173,11 +173,11 @@ def _convex(places: Sequence[Sequence[Array]], magnitudes: Array) -> Mask:
 
 
 def _magnitudes(extremal: Extremal) -> Array:
-    """Of the controls (nu,): the largest on the way, or the range of the bounds; 1 where there is neither."""
+    """Of the controls (nu,): the largest on the way, the range of the bounds where that is zero, else 1."""
     lower, upper = extremal.statement.control_bounds
-    ranges = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-    found = np.maximum(np.abs(extremal.controls).max(axis=0), ranges)
-    return np.where(found > 0.0, found, 1.0)
+    largest = np.abs(extremal.controls).max(axis=0)
+    ranges = np.where(np.isfinite(upper - lower) & (upper > lower), upper - lower, 1.0)
+    return np.where(largest > 0.0, largest, ranges)
 
 
 def _among(convex: Mask, curvature: Array) -> Array:

@@ -74,8 +74,8 @@ def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
     return ca.repmat(shape, 1, count) if shape.nnz() else ca.Sparsity(rows, columns * count)
 
 
-class Told:
-    """A function of scalars as the library is told of it: calls on numbers that lie column after column."""
+class OnColumns:
+    """A function of scalars as the library is told of it, on numbers that lie column after column."""
 
     def __init__(self, function: ca.Function, listed: Program) -> None:
         """Keep what the library points to."""
@@ -111,7 +111,7 @@ class _Columns(Node):
     ) -> None:
         """Keep what the library is told."""
         self._kept = kept
-        self._function, self._count, self._told = function, count, Told(function, listed)
+        self._function, self._count, self._told = function, count, OnColumns(function, listed)
         self._derived: dict[tuple[str, int], ca.Function] = {}
         shapes = [function.sparsity_in(i) for i in range(function.n_in())]
         results = [function.sparsity_out(i) for i in range(function.n_out())]

@@ -21,7 +21,7 @@ from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.passage.columns import Told
+from covocp.passage.columns import OnColumns
 from covocp.passage.library import functions
 from covocp.passage.operations import program
 
@@ -147,7 +147,7 @@ def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Col
     """
     listed = program(function) if functions() is not None else None
     if listed is not None:
-        return _compiled(function, width, shared, Told(function, listed))
+        return _compiled(function, width, shared, OnColumns(function, listed))
     if function.is_a("SXFunction"):
         known = {*OPERATIONS, ca.OP_IF_ELSE_ZERO, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
         if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
@@ -219,7 +219,7 @@ def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> 
     return Columns(inputs=inputs, outputs=outputs, evaluate=evaluate)
 
 
-def _compiled(function: ca.Function, width: int, shared: tuple[int, ...], told: Told) -> Columns:
+def _compiled(function: ca.Function, width: int, shared: tuple[int, ...], on_columns: OnColumns) -> Columns:
     """The scalar graph in the compiled library, on fixed buffers, with what is shared beside each column."""
     memory, results = _columns_apart(function, width)
     own = {i: np.zeros(function.size1_in(i)) for i in shared}
@@ -228,7 +228,7 @@ def _compiled(function: ca.Function, width: int, shared: tuple[int, ...], told: 
     def evaluate() -> None:
         for i, values in own.items():
             memory[i][:] = values
-        if told.run(addresses, width):
+        if on_columns.run(addresses, width):
             raise MemoryError
 
     inputs = tuple(own.get(i, array.T) for i, array in enumerate(memory))

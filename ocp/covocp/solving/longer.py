@@ -45,7 +45,7 @@ def from_longer(
         failed: the outcome, and the start from which it came.
         prepared: what ran.
         statement: of the problem.
-        values: of the parameters.
+        values: of the parameters, (np,).
         guess: what was given as such.
         reporter: of iterations.
 

@@ -223,8 +223,8 @@ class ChainRuns:
     def _from_longer(self, begun: Begun, prepared: Any, failed: ChainOutcome) -> ChainOutcome:
         """Solved from longer durations where a run has failed with conditions that are not met; else as it failed."""
         guessed = [[st.duration.guess, *longer(st.duration)] for st in self._chain.statements]
-        warm = any(guess.warm for guess in begun.guesses) or "max_iterations" in self._own
-        if warm or not may_be_too_short(failed, self._reporter):
+        once = any(guess.warm for guess in begun.guesses) or "max_iterations" in self._own
+        if once or not may_be_too_short(failed, self._reporter):
             return failed
         failed = tried = with_stalled(failed, self._reporter)
         for k in range(1, max(map(len, guessed))):
