@@ -112,16 +112,17 @@ def worth_a_run(own: Merit, others: Sequence[tuple[Merit, Start]]) -> list[Start
     finite = [entry for entry in others if np.isfinite(entry[0]).all()]
     little = max([own.violation, *(merit.violation for merit, _ in finite)]) <= LITTLE
     size = max([abs(own.cost), *(abs(merit.cost) for merit, _ in finite)])
-
-    def alike(one: Merit, other: Merit) -> bool:
-        conditions = max(abs(one.violation - other.violation), abs(one.mark - other.mark) / max(1.0, abs(one.mark)))
-        return abs(one.cost - other.cost) <= SAME * size and conditions <= SAME
-
     found: list[tuple[Merit, Start]] = []
     for merit, start in sorted(finite, key=lambda entry: (0.0 if little else entry[0].violation, entry[0].cost)):
-        if not any(alike(merit, other) for other in (own, *(kept for kept, _ in found))):
+        if not any(alike(merit, other, size) for other in (own, *(kept for kept, _ in found))):
             found.append((merit, start))
     return [start for _, start in found[:MOST_SIDES]]
+
+
+def alike(one: Merit, other: Merit, size: float) -> bool:
+    """Whether two starts are mirror images of one another: costs, beside this size of them, and conditions agree."""
+    conditions = max(abs(one.violation - other.violation), abs(one.mark - other.mark) / max(1.0, abs(one.mark)))
+    return abs(one.cost - other.cost) <= SAME * size and conditions <= SAME
 
 
 def _as_told(outcome: Outcome, rival: Guess) -> bool:

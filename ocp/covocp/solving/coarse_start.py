@@ -38,11 +38,22 @@ def coarser(statement: Statement, options: Options, mesh: Mesh, parameters: Arra
         mesh: with its instants.
         parameters: of the statement.
     """
-    if not waits(statement):
-        return None
+    return thinned(statement, options, mesh, parameters, INTERVALS) if waits(statement) else None
+
+
+def thinned(statement: Statement, options: Options, mesh: Mesh, parameters: Array, least: int) -> Options | None:
+    """The options with about so many intervals of a mesh, and some between any two instants; None: it has few more.
+
+    Args:
+        statement: the problem.
+        options: those of the mesh.
+        mesh: with its instants.
+        parameters: of the statement.
+        least: so many intervals.
+    """
     nodes = distinct(mesh.nodes)
     places = distinct([0.0, *statement.instants, 1.0])
-    enough = max(INTERVALS, BETWEEN * (places.size - 1))
+    enough = max(least, BETWEEN * (places.size - 1))
     if nodes.size - 1 < TIMES * enough:
         return None
     step = int(np.ceil((nodes.size - 1) / enough))

@@ -34,6 +34,7 @@ from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
+from covocp.solving.excitations import otherwise_excited
 from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
@@ -322,6 +323,11 @@ class Solver(ClassicalRuns):
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         outcome = off_the_limit(ready, self._prepared, outcome, *where)
+        if assess and first is None and not self._counted:
+            own = self._own if self._by_ipopt else {}
+            coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **own)
+            run = (self._prepared, self._solved, self._options, coarse)
+            outcome, start = otherwise_excited((outcome, start), *run, guess, reporter)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(

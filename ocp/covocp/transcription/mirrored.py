@@ -53,7 +53,7 @@ def _kept(statement: Statement, mesh: Mesh, values: tuple[float, ...], linked: b
 
 
 def _made(statement: Statement, mesh: Mesh, parameters: Array, own: First, linked: bool) -> tuple[Trajectory, ...]:
-    if own.unbent is None or own.held or not own.plain or not _learns(statement, linked):
+    if own.unbent is None or own.held or not own.plain or not learns(statement, linked=linked):
         return ()
     bend = own.trajectory.u - own.unbent
     if not np.isfinite(own.trajectory.x).all() or not bend.any():
@@ -70,7 +70,7 @@ def _made(statement: Statement, mesh: Mesh, parameters: Array, own: First, linke
     return (first, *(brought(own.unbent + signs * bend) for signs in _signs(bend)))
 
 
-def _learns(statement: Statement, linked: bool) -> bool:
+def learns(statement: Statement, *, linked: bool) -> bool:
     """Whether cost or conditions, of others too where it is linked, read matrices, and these depend on the nominal."""
     if not statement.matrices or statement.coupled:
         return False
