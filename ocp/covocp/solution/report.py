@@ -413,6 +413,8 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{stats['tried']} starts tried")
     if "untried" in stats and solution.within is None:
         effort.append(untried_told(stats["untried"]))
+    if stats.get("excited"):
+        effort.append("another number of switches was cheaper")
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
     if "starts" in stats and solution.within is None:

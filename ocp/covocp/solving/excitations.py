@@ -156,9 +156,7 @@ def _excited(statement: Statement, mesh: Mesh, outcome: Outcome, u: Array) -> Tr
     return completed(statement, mesh, extremal.parameters, u, start=begin, duration=duration)
 
 
-def _run(
-    prepared: Prepared, values: Array, trajectory: Trajectory, reporter: Progress
-) -> tuple[Outcome, Guess] | None:
+def _run(prepared: Prepared, values: Array, trajectory: Trajectory, reporter: Progress) -> tuple[Outcome, Guess] | None:
     """What is found from a trajectory, and the start; None where the model has no values there."""
     start = Guess(trajectory=trajectory)
     try:

@@ -324,8 +324,8 @@ class Solver(ClassicalRuns):
             self._keep(self._options, prepared)
         outcome = off_the_limit(ready, self._prepared, outcome, *where)
         if assess and first is None and not self._counted:
-            own = self._own if self._by_ipopt else {}
-            coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **own)
+            taken = self._own if self._by_ipopt else {}
+            coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **taken)
             run = (self._prepared, self._solved, self._options, coarse)
             outcome, start = otherwise_excited((outcome, start), *run, guess, reporter)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
