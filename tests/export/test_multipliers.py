@@ -84,11 +84,7 @@ def test_what_is_stopped_early_is_called_solved_only_where_it_is_the_optimum():
     seen, limited = set(), 0
     for most in (1, 2, 3):
         options = {"plugin_options": {"max_iter": most}}
-        try:
-            made = export_c(swing(0.6, 1.2), FOLDER / f"swing_stopped_{most}", intervals=INTERVALS, **options)
-        except co.ExportError as error:
-            assert "NOT_CONVERGED" in str(error)  # told at the export already
-            continue
+        made = export_c(swing(0.6, 1.2), FOLDER / f"swing_stopped_{most}", intervals=INTERVALS, **options)
         planner = made.reference()
         for x0, v0 in starts(30):
             best = whole(initial_x=x0, initial_v=v0)
