@@ -46,7 +46,7 @@ def least_cost(x0, v0):
 
 @pytest.fixture(scope="module")
 def free():
-    return export_c(swing(), FOLDER / "swing", intervals=INTERVALS)
+    return export_c(swing(), FOLDER / "swing_free", intervals=INTERVALS)
 
 
 def starts(count, seed=5):
