@@ -166,7 +166,7 @@ class GradientChainSolver:
         """The first trajectory must stay in the domain of the model."""
         for space, own in zip(current.spaces, current.parts, strict=True):
             if np.isfinite(own.run.z).all():
-                check_costs(_trajectory(space, own), own.run.running, own.run.terminal)
+                check_costs(space.sweeps.statement, _trajectory(space, own), own.run.running, own.run.terminal)
         check_domain(current.run.finite, misled)
 
 

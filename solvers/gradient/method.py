@@ -267,7 +267,7 @@ class GradientSolver:
         built = time.perf_counter()
         current = space.first(guess)
         if np.isfinite(current.run.z).all():
-            check_costs(self._trajectory(current), current.run.running, current.run.terminal)
+            check_costs(self._statement, self._trajectory(current), current.run.running, current.run.terminal)
         check_domain(current.run.finite, misled)
         search = Search(space, self._settings, progress)
         end = search.run(current)

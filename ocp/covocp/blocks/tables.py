@@ -153,9 +153,11 @@ def table(name: str, grid: Given, values: Given, *, kind: Literal["linear", "cub
 
 def _knots(name: str, given: Given, kind: str) -> Array:
     """Knots of one variable, checked."""
+    expected = "shape (K,); of several variables a tuple of such, not a list or an array"
+    if isinstance(given, list) and any(isinstance(axis, (list, tuple, np.ndarray)) and np.size(axis) for axis in given):
+        raise _wrong(name, "has knots of another shape", expected, f"a list of {len(given)} arrays of knots")
     knots = np.array(as_number(name, "knots", given), dtype=float)
     if knots.ndim != 1:
-        expected = "shape (K,); of several variables a tuple of such, not a list or an array"
         raise _wrong(name, "has knots of another shape", expected, f"shape {knots.shape}")
     if not np.isfinite(knots).all():
         raise _wrong(name, "has knots that are not finite", "finite numbers", "NaN or inf")

@@ -35,6 +35,8 @@ MISS = 1e-6
 FAR, ROUNDING = 1e3, 1e-14
 # By how much Ipopt may pass a bound of a variable, in its scale, on short intervals by more: its nominals miss nothing.
 RELAXED = 1e-7
+# The message of a run that is not finite.
+NOT_FINITE = "the model becomes NaN or inf along this nominal"
 
 
 def evaluation_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
@@ -88,7 +90,7 @@ def evaluate_controls(
         extremal=extremal,
         cost_terms={"terminal": terminal, "running": float(running.item())},
         converged=finite,
-        message="evaluated along a given nominal" if finite else "the model becomes NaN or inf along this nominal",
+        message="evaluated along a given nominal" if finite else NOT_FINITE,
         violations=missed(extremal) if finite else {},
         stats={},
     )

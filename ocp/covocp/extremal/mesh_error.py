@@ -284,6 +284,17 @@ def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tup
     return total, size
 
 
+def moved_by_halves(extremal: Extremal) -> float:
+    """Largest change of a state by halving the steps, in its range; inf where something is not finite with them."""
+    finer, nx = _halved(extremal), extremal.statement.nx
+    if not all(np.isfinite(v).all() for v in (finer.jumps, finer.states, finer.matrices, finer.running)):
+        return float("inf")
+    moved, size = _by_segments(extremal, 0.0)
+    with np.errstate(all="ignore"):
+        shares = np.where(moved[:nx] > 0.0, moved[:nx] / size[:nx], 0.0)
+    return float(np.where(np.isnan(shares), np.inf, shares).max(initial=0.0))
+
+
 def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
     nx = extremal.statement.nx
     return departure(extremal, moved[:nx], size[:nx])

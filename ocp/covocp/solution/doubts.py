@@ -13,7 +13,16 @@ from covocp.extremal.coarse_controls import cost_of_form
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.links import Within
-from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
+from covocp.extremal.mesh_error import (
+    COARSE_MESH,
+    LONG_STEPS,
+    OPTIMISED,
+    Unseen,
+    moved_by_halves,
+    node_error,
+    unseen,
+    unstable,
+)  # fmt: skip
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.origin import METHOD
@@ -190,6 +199,12 @@ def _unknown_error(solution: Solution) -> str:
     if undefined:
         name, time = min(undefined.items(), key=lambda item: item[1])
         return f"{said}'{name}' is NaN or inf, first at t = {time:.4g} s. Keep what it depends on where it has a value."
+    halves = (
+        f"{said}with integration steps of half the length a state, a covariance or the cost becomes NaN or inf. Use "
+        "more intervals or substeps."
+    )
+    if solution.statement is not None and np.isinf(moved_by_halves(solution.extremal)):
+        return halves
     costates = np.hstack([solution.costates.state, solution.costates.matrices])
     broken = np.flatnonzero(~np.isfinite(costates).all(axis=1))
     if broken.size:  # they are integrated from the end: what is last in time came first
@@ -197,10 +212,7 @@ def _unknown_error(solution: Solution) -> str:
             f"{said}the costates are NaN or inf up to t = {solution.t[broken[-1]]:.4g} s, where a rate, a cost or a "
             "condition has no finite slope. Keep what it depends on away from there."
         )
-    return (
-        f"{said}with integration steps of half the length a state, a covariance or the cost becomes NaN or inf. Use "
-        "more intervals or substeps."
-    )
+    return halves
 
 
 def _mention_tables(solution: Solution) -> None:

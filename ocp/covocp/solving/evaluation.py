@@ -134,8 +134,7 @@ def _along(
     given = options_along(st, nominal, first_options(nominal, intervals, options), values)
     outcome = run_along(st, nominal, given, values)
     own_steps = given.substeps == "auto"
-    if not outcome.converged:
-        outcome = with_shortest_steps(outcome, given, lambda shorter: run_along(st, nominal, shorter, values))
+    outcome = with_shortest_steps(outcome, given, lambda shorter: run_along(st, nominal, shorter, values))
     while own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, given)):
         shorter = run_along(st, nominal, finer, values)
         if not shorter.converged:
@@ -143,8 +142,9 @@ def _along(
         outcome, given = shorter, finer
     check_noise(outcome.extremal)
     if outcome.converged:
-        check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
-    with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
+        terms = outcome.cost_terms
+        check_costs(st, outcome.extremal.trajectory, terms["running"], terms["terminal"], evaluated=True)
+    with np.errstate(over="ignore", invalid="ignore"):  # a condition that is infinite is told by its name
         solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
     return told(solution) if solution.converged else solution
 

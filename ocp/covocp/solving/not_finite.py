@@ -1,27 +1,36 @@
-"""A run along given controls that is not finite: of the model, or of steps that are too long for it."""
+"""A run along given controls that is not finite or goes astray: by the model, or by steps that are too long for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered
+from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal, Outcome
-from covocp.extremal.mesh_error import mesh_error
+from covocp.extremal.given_controls import NOT_FINITE
+from covocp.extremal.mesh_error import mesh_error, moved_by_halves
+from covocp.transcription.first_guess import diverges
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, Options
 
 # Error of an integration that chooses its own steps, relative; calls of the model it may take; what counts as infinite.
 ACCURACY, MOST_CALLS, INFINITE = 1e-6, 50_000, 1e100
 # Largest relative error of the cost of a run with the shortest steps that is taken for one.
 TAKEN = 1e-2
-TOO_LONG = (
-    "the integration steps are too long for the model, which stays finite along this nominal: take more intervals "
-    "(grid= where it is fast), substeps= or step='rodas'"
+# Ranges of a state by which halving the steps moves it where a run is doubted, and where it grows beyond all that is
+# known of it; by which a run is then astray.
+DOUBTED, GROWN, ASTRAY = 1e3, 0.1, 1.0
+TOO_LONG = "the integration steps are too long for the model, which stays finite along this nominal"
+UNSURE = (
+    "with integration steps of half the length a state, a covariance or the cost becomes NaN or inf along this "
+    "nominal: take more intervals or substeps="
 )
 NOT_KNOWN = (
     "the run becomes NaN or inf along this nominal; whether by the model or by steps that are too long is not known: "
@@ -33,14 +42,27 @@ class _EnoughError(Exception):
     """The model was called so often that it is not known where it goes."""
 
 
-def ends_at(extremal: Extremal) -> float:
-    """The time [s] up to which the nominal is finite where the length of each step follows from its error.
+@dataclass(frozen=True, kw_only=True)
+class _Followed:
+    """The nominal where the length of each step follows from its error.
+
+    Attributes:
+        end: time [s] up to which it is finite: the duration where it is so all the way; NaN where the model would have
+            to be called too often to know.
+        states: at the nodes, (N + 1, nx); NaN from where on it is not known.
+    """
+
+    end: float
+    states: Array
+
+    __repr__ = short_repr
+
+
+def _followed(extremal: Extremal) -> _Followed:
+    """The nominal by steps that are as short as they must be.
 
     Args:
         extremal: a trajectory whose controls and initial state count, of a nominal that does not depend on matrices.
-
-    Returns:
-        The duration where it is finite all the way; NaN where the model would have to be called too often to know.
     """
     from scipy.integrate import LSODA  # here: few runs are lost, and importing covocp must not take long
 
@@ -60,52 +82,95 @@ def ends_at(extremal: Extremal) -> float:
         return np.full(st.nx, np.nan) if found is None else found[0]
 
     known, x = 0.0, t.x[0]
+    states = np.full((extremal.time.size, st.nx), np.nan)
+    states[0] = x
     size = ACCURACY * 1e-3 * max(float(np.abs(x).max(initial=0.0)), 1e-6)
     with np.errstate(all="ignore"):
-        for begin, end in zip(extremal.time[:-1], extremal.time[1:], strict=True):  # rates may jump at a node
-            if end <= begin:
-                continue
-            solver = LSODA(rates, begin, x, end, rtol=ACCURACY, atol=size)
-            try:
-                while solver.status == "running":
-                    solver.step()
-                    if not np.isfinite(solver.y).all() or np.abs(solver.y).max(initial=0.0) > INFINITE:
-                        return known
-                    known = float(solver.t)
-            except _EnoughError:
-                return float(np.nan)
-            except ValueError:  # scipy's, of numbers that are none
-                return known
-            if solver.status == "failed":
-                return known
-            x = solver.y
-    return t.duration
+        for k, (begin, end) in enumerate(pairwise(extremal.time), start=1):  # rates may jump at a node
+            if end > begin:
+                solver = LSODA(rates, begin, x, end, rtol=ACCURACY, atol=size)
+                try:
+                    while solver.status == "running":
+                        solver.step()
+                        if not np.isfinite(solver.y).all() or np.abs(solver.y).max(initial=0.0) > INFINITE:
+                            return _Followed(end=known, states=states)
+                        known = float(solver.t)
+                except _EnoughError:
+                    return _Followed(end=float("nan"), states=states)
+                except ValueError:  # scipy's, of numbers that are none
+                    return _Followed(end=known, states=states)
+                if solver.status == "failed":
+                    return _Followed(end=known, states=states)
+                x = solver.y
+            states[k] = x
+    return _Followed(end=t.duration, states=states)
 
 
 def with_shortest_steps(outcome: Outcome, options: Options, run: Callable[[Options], Outcome]) -> Outcome:
-    """A run that is not finite once more with as many steps as there may be; else why it is not.
+    """A run that is not finite or goes astray once more with as many steps as there may be; else why it does.
+
+    A run is looked at that is not finite, or that shorter steps would not leave finite or take far away; what it costs
+    says nothing, and it does not count as evaluated, unless its states are those of the model.
 
     Args:
-        outcome: of the run; as it is where the nominal is finite.
+        outcome: of the run.
         options: of its mesh.
         run: with other options.
     """
     extremal = outcome.extremal
     st, duration = extremal.statement, extremal.trajectory.duration
-    if st.coupled or st.nominal is None or np.isfinite(extremal.trajectory.x).all():
+    moved = moved_by_halves(extremal) if outcome.converged else np.inf
+    if moved <= DOUBTED and not (moved > GROWN and _grown(extremal)):
         return outcome
-    end = ends_at(extremal)
-    if np.isnan(end):
-        return replace(outcome, message=NOT_KNOWN)
-    if end < duration:
-        return replace(outcome, message=f"{outcome.message}, at t = {end:.4g} s")
+    if st.coupled or st.nominal is None:
+        return _without_value(outcome, UNSURE) if outcome.converged and not np.isfinite(moved) else outcome
+    followed = _followed(extremal)
+    lost = not np.isfinite(moved)
+    if np.isnan(followed.end):
+        return _without_value(outcome, NOT_KNOWN) if lost else outcome
+    if followed.end < duration:
+        return _without_value(outcome, f"{NOT_FINITE}, at t = {followed.end:.4g} s") if lost else outcome
+    astray = _astray(extremal, followed.states)
+    if not astray:
+        return _without_value(outcome, UNSURE) if lost and outcome.converged else outcome
     least, best = TAKEN, outcome
     for step in ("rodas", "rk4") if options.substeps == "auto" else ():
         try:
             found = run(replace(options, step=step, substeps=LARGEST_SUBSTEPS))
         except ProblemError:  # steps of this kind are too long as they are at the start
             continue
-        error = mesh_error(found.extremal, found.cost_terms["running"]) if found.converged else np.inf
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = mesh_error(found.extremal, found.cost_terms["running"]) if found.converged else np.inf
         if error < least:
             least, best = error, found
-    return best if best is not outcome else replace(outcome, message=TOO_LONG)
+    if best is not outcome:
+        return best
+    others = "or substeps=" if options.step == "rodas" else "substeps= or step='rodas'"
+    grid = "take more intervals (grid= where it is fast)"
+    remedy = f"{grid} {others}" if options.step == "rodas" else f"{grid}, {others}"
+    return _without_value(outcome, f"{TOO_LONG} ({astray}): {remedy}")
+
+
+def _grown(extremal: Extremal) -> bool:
+    """Whether a state grows beyond all that is known of it."""
+    return diverges(extremal.trajectory.x, extremal.statement.boundary_values(extremal.parameters)[1])
+
+
+def _without_value(outcome: Outcome, message: str) -> Outcome:
+    """An outcome whose numbers say nothing, with the reason."""
+    return replace(outcome, converged=False, message=message, violations={})
+
+
+def _astray(extremal: Extremal, states: Array) -> str:
+    """Where a run is first astray from the states at the nodes that are right, (N + 1, nx), in words; "" nowhere."""
+    x, names = extremal.trajectory.x, extremal.statement.state_names
+    size = np.abs(states).max(axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(x - states) / np.where(size > 0.0, size, 1.0)
+    off = np.where(np.isfinite(x), off, np.inf)
+    rows = np.flatnonzero((off > ASTRAY).any(axis=1))
+    if not rows.size:
+        return ""
+    k = int(rows[0])
+    i = int(off[k].argmax())
+    return f"at t = {extremal.time[k]:.4g} s '{names[i]}' is {x[k, i]:.3g} in place of {states[k, i]:.3g}"

@@ -179,7 +179,8 @@ def solved(chain: Chain, runs: Runs) -> PhasesSolution:
     extremals = []
     for outcome, values in zip(runs.outcomes, runs.parameters, strict=True):
         extremal = outcome.extremal
-        check_costs(extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
+        terms = outcome.cost_terms
+        check_costs(extremal.statement, extremal.trajectory, terms["running"], terms["terminal"], evaluated=True)
         extremals.append(replace(extremal, stated=replace(extremal.statement, values=values)))
     missed = {
         f"{st.name}: {name}": value

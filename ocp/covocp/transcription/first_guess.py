@@ -337,13 +337,13 @@ def simulated(
         values = np.vstack([start, swept(advance, np.concatenate([start, e0]), *columns)[0][:, : statement.nx]])
     else:
         values = nominal_states(statement, mesh, start, u, duration, parameters)
-    if np.isfinite(values).all() and not _diverges(values, statement.boundary_values(parameters)[1]):
+    if np.isfinite(values).all() and not diverges(values, statement.boundary_values(parameters)[1]):
         lower, upper = statement.state_bounds
         return np.asarray(np.clip(values, lower, upper))
     return None
 
 
-def _diverges(values: Array, final: Array) -> bool:
+def diverges(values: Array, final: Array) -> bool:
     """Whether some state grows beyond all that is known of it: its values at the ends, and where it moves at first.
 
     In a small unit of length or a large one of time a number may be large that is not.

@@ -12,7 +12,7 @@ from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.errors import OutsideDomainError
 from covocp.base.expressions import slopes_by
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, is_semidefinite, unpack
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.before_reading import hold, unfed
@@ -332,23 +332,49 @@ def _fix(lower: Array, upper: Array, values: Array) -> None:
     lower[known] = upper[known] = values[known]
 
 
-def check_costs(trajectory: Trajectory, running: float, terminal: float) -> None:
-    """Costs of a first trajectory must be finite.
+def check_costs(
+    statement: Statement, trajectory: Trajectory, running: float, terminal: float, *, evaluated: bool = False
+) -> None:
+    """Costs of a first trajectory, or of one that is evaluated, must be finite.
 
     Raises:
         OutsideDomainError: names the one that is not.
     """
+    what, expected = "the initial guess", "a finite cost where the solver starts"
+    remedy = "give another guess of controls or states, or bounds that keep the model in its domain"
+    if evaluated:
+        what, expected = "this nominal", "a finite cost of what is evaluated"
+        remedy = "give another nominal, or keep what the cost depends on where it has a value"
     for name, value, where in (("running", running, "along"), ("terminal", terminal, "at the end of")):
         if not np.isfinite(value):
             last = np.array2string(trajectory.x[-1], precision=4, threshold=8)
-            remedy = "give another guess of controls or states, or bounds that keep the model in its domain"
-            if np.isfinite(trajectory.x).all() and not np.isfinite(trajectory.e).all():
+            received, broken = f"final state {last}", _broken_covariance(statement, trajectory)
+            lost = np.flatnonzero(~np.isfinite(trajectory.x).all(axis=1))
+            if lost.size:  # segments behind it begin at guessed states, so the last one says nothing
+                received = f"states that are NaN or inf at node {lost[0]} of {trajectory.x.shape[0] - 1}"
+                remedy = (
+                    "where the integration steps are too long for the model take more intervals (grid= where it is "
+                    f"fast), substeps= or step='rodas'; else {remedy}"
+                )
+            elif broken or not np.isfinite(trajectory.e).all():
+                received = broken or received
                 remedy = (
                     "the steps of the matrices are too long: use covariance_step='gauss', more substeps or intervals"
                 )
             raise OutsideDomainError(
-                f"The cost '{name}' is {value} {where} the initial guess.",
-                expected="a finite cost where the solver starts",
-                received=f"final state {last}, T = {trajectory.duration:g} s",
+                f"The cost '{name}' is {value} {where} {what}.",
+                expected=expected,
+                received=f"{received}, T = {trajectory.duration:g} s",
                 remedy=remedy,
             )
+
+
+def _broken_covariance(statement: Statement, trajectory: Trajectory) -> str:
+    """A covariance along a trajectory that is none, which it becomes by steps that are too long; "" where all are."""
+    for block in (b for b in statement.matrices if b.covariance):
+        matrices = unpack(trajectory.e[:, block.span], block.size)
+        if np.isfinite(matrices).all() and not is_semidefinite(matrices):
+            least = np.linalg.eigvalsh(matrices)[:, 0]
+            k = int(least.argmin())
+            return f"'{block.name}' with the eigenvalue {least[k]:.3g} at node {k} of {least.size - 1}"
+    return ""

@@ -220,8 +220,8 @@ class Program:
             OutsideDomainError: names the part that is not.
         """
         trajectories, values = self.unpack(w, parameters)
-        for trajectory, costs in zip(trajectories, values["parts"], strict=True):
-            check_costs(trajectory, costs["running"], costs["terminal"])
+        for part, trajectory, costs in zip(self.parts, trajectories, values["parts"], strict=True):
+            check_costs(part.statement, trajectory, costs["running"], costs["terminal"])
 
     def _given(self, i: int, trajectory: Trajectory, parameters: Array, later: Array) -> tuple[Array, Array]:
         """What a link gives along a trajectory of the part before it."""

@@ -20,6 +20,7 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
+from covocp.export.laws.conditions import INFEASIBLE, STATIONARY, lagrangian_slope, residuals
 from covocp.export.laws.law import CODES, QUATERNION, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
 from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
@@ -38,8 +39,6 @@ from covocp.transcription.shooting import compiled_steps
 from covocp.transcription.stiffness import nominal_along
 from covocp.transcription.transcribing import transcribe, written_out
 
-# In the NLP's own units: what counts as solved.
-INFEASIBLE, STATIONARY = 1e-6, 1e-5
 # Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
 ROUNDING, APART = 1e-6, 1e-2
 # Directions in which the curvature of the cost is looked at, and how far, in units of the variables.
@@ -252,7 +251,7 @@ def _multipliers(nlp: NLP, solution: Solution, scale: float, *, timed: bool) -> 
     _, constraints = nlp.pack_multipliers(solution.multipliers, (costates.state, costates.matrices))
     weights, bounds, w = constraints / scale, nlp.bounds(nlp.statement.values), nlp.pack(solution.trajectory)
     weights[np.abs(weights) < UNREACHED] = 0.0
-    left = -np.asarray(_lagrangian_slope(nlp)(w, p, weights).full()).ravel()
+    left = -np.asarray(lagrangian_slope(nlp)(w, p, weights).full()).ravel()
     reached = ((w > bounds["ubx"] - UNREACHED) & (left > 0.0)) | ((w < bounds["lbx"] + UNREACHED) & (left < 0.0))
     reached[-1] |= timed
     return np.where(reached & (np.abs(left) > UNREACHED), left, 0.0), weights
@@ -262,7 +261,7 @@ def _cost_scale(nlp: NLP, solution: Solution) -> float:
     """Size of the cost; where that is zero, or nothing but rounding, of its slope near the solution."""
     size = float(np.abs(list(solution.cost_terms.values())).sum())
     near = (1.0 + APART) * nlp.pack(solution.trajectory) + APART
-    gradient = _lagrangian_slope(nlp)(near, np.append(nlp.statement.values, 1.0), 0.0)
+    gradient = lagrangian_slope(nlp)(near, np.append(nlp.statement.values, 1.0), 0.0)
     slope = float(np.abs(np.asarray(gradient.full())).max(initial=0.0))
     if not np.isfinite(slope) or size > ROUNDING * slope:
         return size or 1.0
@@ -271,23 +270,13 @@ def _cost_scale(nlp: NLP, solution: Solution) -> float:
 
 def _curvature(nlp: NLP, solution: Solution) -> float:
     """Typical second derivative of the cost in units of the variables, near the solution."""
-    w, p, slope = nlp.pack(solution.trajectory), np.append(nlp.statement.values, 1.0), _lagrangian_slope(nlp)
+    w, p, slope = nlp.pack(solution.trajectory), np.append(nlp.statement.values, 1.0), lagrangian_slope(nlp)
     random, found = np.random.default_rng(SEED), []
     for _ in range(DIRECTIONS):
         step = NEAR * random.standard_normal(w.size)
         change = np.asarray((slope(w + step, p, 0.0) - slope(w, p, 0.0)).full())
         found.append(float(np.linalg.norm(change) / max(np.linalg.norm(step), np.finfo(float).tiny)))
     return float(np.nan_to_num(np.median(found), posinf=0.0))
-
-
-def _lagrangian_slope(nlp: NLP) -> ca.Function:
-    """(variables, parameters, multipliers of the constraints) -> slopes of the Lagrangian without bounds."""
-    weights = ca.MX.sym("multipliers", nlp.g.shape[0])
-    if nlp.gradient is None:
-        slope = ca.gradient(nlp.f + ca.dot(weights, nlp.g), nlp.w)
-    else:
-        slope = nlp.gradient[1] + ca.mtimes(nlp.jacobian.T, weights)
-    return ca.Function("lagrangian_slope", [nlp.w, nlp.p, weights], [ca.densify(slope)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,10 +316,13 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
     given |= {"p": ca.vertcat(p, task.scale), **(narrowed(bounds) if method == "fatrop" else bounds)}
     result = solver(**given)
     evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
-    residuals = _residuals(task, nlp, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
-    residuals = ca.fmax(residuals[0], outside(task.nlp, p)), residuals[1]
-    outputs = _results(task, result["x"], evaluated, residuals)
-    bad = ca.logic_not(ca.logic_and(residuals[0] <= INFEASIBLE, residuals[1] <= STATIONARY))
+    weights = {name: task.scale / task.unit * result[name] for name in ("lam_x", "lam_g")}
+    at = {"x": result["x"], "p": ca.vertcat(p, task.unit), "g": evaluated[-1], **bounds, **weights}
+    slopes = solver.get_function("nlp_jac_fg") if method == "sqpmethod" else None
+    violation, left = residuals(nlp, at, symbols.get("duration", 1.0), slopes)
+    violation = ca.fmax(violation, outside(task.nlp, p))
+    outputs = _results(task, result["x"], evaluated, (violation, left))
+    bad = ca.logic_not(ca.logic_and(violation <= INFEASIBLE, left <= STATIONARY))
     short = coarse(nlp, p, evaluated)
     good = CODES["OK"] if short is None else ca.if_else(short, CODES["COARSE"], CODES["OK"])
     values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], good)]
@@ -410,25 +402,6 @@ def _results(
 def _where(what: str, nlp: NLP) -> str:
     """Of which times the rows of a result are."""
     return "interval" if what == "control" and nlp.mesh.control == "constant" else "node"
-
-
-def _residuals(
-    task: _Task, nlp: NLP, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
-) -> tuple[Any, Any]:
-    """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
-    by_unit = task.scale / task.unit
-    multipliers = {name: by_unit * result[name] for name in ("lam_x", "lam_g")}
-    left = _lagrangian_slope(nlp)(result["x"], ca.vertcat(p, task.unit), multipliers["lam_g"]) + multipliers["lam_x"]
-    both = ca.vertcat(result["x"], g)
-    lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
-    weights = ca.vertcat(multipliers["lam_x"], multipliers["lam_g"])
-    violation = ca.mmax(ca.fmax(0.0, ca.fmax(lower - both, both - upper)))
-    # the larger of NaN and 0 is 0: what has no value would be met
-    violation = ca.fmax(violation, ca.mmax(ca.if_else(ca.fabs(both) < np.inf, 0.0, np.inf)))
-    violation = ca.fmax(violation, ca.if_else(duration > 0.0, 0.0, 1.0))  # a plan backwards in time is none
-    slack = ca.if_else(weights > 0.0, upper - both, both - lower)
-    loose = ca.mmax(ca.if_else(weights == 0.0, 0.0, ca.fmin(ca.fabs(weights), ca.fabs(slack))))
-    return violation, ca.fmax(ca.norm_inf(left), loose)
 
 
 def _points(task: _Task, default: Array, random: np.random.Generator, count: int) -> Array:
