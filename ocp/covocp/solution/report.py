@@ -38,6 +38,8 @@ GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
 ASKED = "gain_asked"
 # Name of the count that says by what other options a run was made again, where it did not find its way as asked.
 OTHERWISE = "other_ways"
+# Name of the count that says from where a run began in the end, where a solution that was given as a guess led nowhere.
+OTHER_START = "other_start"
 # Multipliers below this share of the cost are not shown.
 NEGLIGIBLE = 1e-6
 # Relative difference of costs below which two starts count as having found the same optimum.
@@ -409,6 +411,8 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{seconds:.3g} s")
     if stats.get(OTHERWISE):
         effort.append(f"{'found' if solution.converged else 'nor found'} by {stats[OTHERWISE]}")
+    if stats.get(OTHER_START):
+        effort.append(f"the guess led nowhere, {stats[OTHER_START]} to this")
     if stats.get("tried", 1) > 1 and solution.within is None:
         effort.append(f"{stats['tried']} starts tried")
     if "untried" in stats and solution.within is None:

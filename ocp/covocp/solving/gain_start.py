@@ -9,9 +9,9 @@ and the nominal, is the solver's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -53,8 +53,13 @@ LARGEST_SPREAD, SPREADS = 1e4, 40
 # Eigenvalue of a slope, relative to the largest, that is zero but for rounding.
 ROUNDOFF = 1e-9
 
+
 # What the user gave and who is told of iterations -> the solution with the best gain, and what a run starts from.
-GainStart = Callable[[Given, Progress], tuple["Solution | None", Given]]
+class GainStart(Protocol):
+    """What makes it; `along`: also where a solution is given, from there."""
+
+    def __call__(self, guess: Given, reporter: Progress, *, along: bool = ...) -> tuple[Solution | None, Given]:
+        """Both."""
 
 
 def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
@@ -67,7 +72,12 @@ def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
 
 
 def best_gain(
-    solvers: tuple[Solver, ...], parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress
+    solvers: tuple[Solver, ...],
+    parameters: Mapping[str, Any] | None,
+    guess: Given,
+    reporter: Progress,
+    *,
+    along: bool = False,
 ) -> Solution | None:
     """The solution with the best gain, without the conditions that ask for another: where a free gain starts.
 
@@ -76,13 +86,17 @@ def best_gain(
         parameters: as the user gave them.
         guess: likewise; one that says where the gain starts needs no other.
         reporter: of the iterations, with the limits of all runs together.
+        along: whether it is wanted all the same, where a solution is given.
     """
+    from covocp.solving.warm_start import Later
+
     named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
-    for solver in solvers if guess is None or named else ():
+    plan = {"guess": guess.plan, "elapsed": guess.elapsed} if isinstance(guess, Later) else {"guess": guess}
+    for solver in solvers if guess is None or named or along else ():
         if reporter.stop:
             break
         seconds, iterations = reporter.left
-        run = {"guess": guess, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
+        run = {**plan, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
         try:
             with without_warnings():  # they concern another solution
                 best: Solution = solver.solve(parameters, progress=False, **run)
@@ -165,6 +179,7 @@ def gain_first(
     reporter: Progress,
     *,
     allow_failure: bool,
+    along: bool = False,
 ) -> tuple[Solution | None, Given]:
     """The solution with the best gain where X asks for a gain, and what a run starts from.
 
@@ -176,11 +191,12 @@ def gain_first(
         guess: that the user gave.
         reporter: of iterations.
         allow_failure: whether what is impossible is tried all the same.
+        along: whether the best gain is wanted where a solution is given, too.
 
     Raises:
         SolveError: no feedback can keep a limit of X.
     """
-    first = best_gain(solvers, parameters, guess, reporter)
+    first = best_gain(solvers, parameters, guess, reporter, along=along)
     if first is None:
         return None, guess
     if not allow_failure:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import fields, replace
 from functools import partial
@@ -29,7 +29,6 @@ from covocp.solving.attempts import best_of, counted, from_starts, interrupted, 
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
-from covocp.solving.classical_runs import ClassicalRuns
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -47,6 +46,7 @@ from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
+from covocp.solving.other_starts import Falling, OtherStarts
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.silent import mention_silent
 from covocp.solving.unused import mention_clock, mention_forgotten, mention_lengths
@@ -60,7 +60,6 @@ from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_
 from covocp.transcription.starts import own_start
 
 if TYPE_CHECKING:
-    from covocp.solving.other_ways import Way
     from covocp.solving.suited_mesh import Beginning
 
 OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
@@ -71,7 +70,7 @@ LARGE = 16
 
 
 @methods_one_at_a_time
-class Solver(ClassicalRuns):
+class Solver(OtherStarts):
     """A problem made ready for one method: built once, solved again with new parameters and guesses.
 
     Args:
@@ -282,7 +281,7 @@ class Solver(ClassicalRuns):
         told = sum(float(solution.stats.get(name, 0.0)) for name in RUN_SECONDS)
         return with_stats(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
 
-    def _from_given(
+    def _from_guess(
         self, values: Array, gain_start: GainStart, guess: Given, reporter: Progress, *, assess: bool
     ) -> tuple[Outcome, Solution | None]:
         """Solve from a guess, an unusable solution left for None; also the best gain's solution where one was made."""
@@ -308,7 +307,7 @@ class Solver(ClassicalRuns):
             if not isinstance(given, Later | Solution):
                 raise
             mention_left(error)
-            return self._from_given(values, gain_start, None, reporter, assess=assess)
+            return self._from_guess(values, gain_start, None, reporter, assess=assess)
         if not self._counted:
             outcome, start = from_longer((outcome, start), self._prepared, self._solved, values, guess, reporter)
         ready, where = partial(self._ready, self._options), (values, reporter, start)
@@ -337,8 +336,8 @@ class Solver(ClassicalRuns):
         guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
         first = None
         if guess is None or best is not None:
-            given = (values, guess, reporter)
-            first = from_coarser(self._solved, self._options, self._prepared.mesh, self._ready, given)
+            run = (values, guess, reporter)
+            first = from_coarser(self._solved, self._options, self._prepared.mesh, self._ready, run)
         starts = [guesses]
         if first is not None:
             coarse = Solution.of(first, self._by, assess=False)
@@ -346,9 +345,12 @@ class Solver(ClassicalRuns):
         if best is not None and guess is not best:
             starts.append(make_guesses(self._solved, self._prepared.mesh, values, best))
         # what leads astray on such steps goes another way
+        given = isinstance(guess, Later | Solution)
         watched_over = self._otherwise and self._prepared.mesh.step == "rk4" and bounded_below(self._solved)
         for several in starts:
-            most = part(reporter, None, best) if best is not None and watched_over else reporter
+            most = reporter
+            if watched_over and (best is not None or given):
+                most = Falling(reporter) if best is None else part(reporter, None, best)
             outcome, start = from_starts(self._prepared, values, several, most)
             if most is not reporter and most.spent and not outcome.converged:
                 outcome = replace(outcome, message=f"stopped at {most.spent}")
@@ -422,34 +424,6 @@ class Solver(ClassicalRuns):
             return
         if finer is not None:
             self._keep(finer, self._ready(finer))
-
-    def _otherwise_solved(self, failed: Outcome, best: Solution, near: Solution, reporter: Progress) -> Outcome:
-        """Solved from the best gain by loosened limits of the spread, or from nearby another way; else as it failed.
-
-        The way that finds a solution is that of later runs.
-        """
-        from covocp.solving.gain_ways import by_any_way
-
-        given = (self._solved, self._options, self._ready, self._other_ways, failed, (best, near), reporter)
-        outcome, kept = by_any_way(*given, further=not beyond(self._problem.declarations, best))
-        if kept is not None:
-            self._keep_way(*kept)
-        return outcome
-
-    def _other_ways(self) -> Iterator[Way]:
-        """Those that are open."""
-        from covocp.solving.other_ways import other_ways
-
-        taken = method_options(self._by)
-        return other_ways(self._solved, self._options, self._prepared.mesh, self._own, taken)
-
-    def _keep_way(self, way: Way, prepared: Prepared) -> None:
-        """Later runs begin this way, also on other meshes."""
-        self._by, self._own = way.method or self._by, {**self._own, **way.own}
-        self._ungraded = self._ungraded[0], replace(self._ungraded[1], **way.mesh)
-        self._asked = replace(self._asked, **way.mesh)
-        self._keep(replace(self._options, **way.mesh), prepared)
-        self._first = (self._options, prepared) if self._remade else (replace(self._first[0], **way.mesh), prepared)
 
     def _classical_design(self) -> ClassicalDesign:
         """The classical design on the present mesh."""
