@@ -65,7 +65,7 @@ def mention_doubts(solution: Solution) -> None:
     elif not (error <= COARSE_MESH or by_steps):
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
-            + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
+            + (", or the states. Put a node where a rate jumps, if one does (grid=). " if depends_on_time else ". ")
             + ("U" if solution.method == METHOD else "Let refine=1e-4 put nodes where they are needed, or u")
             + "se more intervals or substeps."
         )
