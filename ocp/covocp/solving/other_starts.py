@@ -18,7 +18,6 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.problem.builder import Problem
-from covocp.solution.report import OTHER_START
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, rank, with_stats
 from covocp.solving.classical_runs import ClassicalRuns
@@ -99,6 +98,8 @@ class OtherStarts(ClassicalRuns):
             return outcome, first
         if passed_at_the_start(outcome) or (reporter.limited and not self._otherwise):
             return outcome, first
+        from covocp.solution.report import OTHER_START
+
         outcome = with_stalled(outcome, reporter)  # of the iterations of this run, not of all together
         kept, looked = (self._options, self._prepared), self._looked
         for name, run in self._others(values, gain_start, guess, reporter, assess=assess):
