@@ -154,7 +154,11 @@ def table(name: str, grid: Given, values: Given, *, kind: Literal["linear", "cub
 def _knots(name: str, given: Given, kind: str) -> Array:
     """Knots of one variable, checked."""
     expected = "shape (K,); of several variables a tuple of such, not a list or an array"
-    axes = [axis for axis in given if np.iterable(axis)] if isinstance(given, list) else []
+    axes = (
+        [a for a in given if isinstance(a, (list, tuple, np.ndarray)) and np.iterable(a)]
+        if isinstance(given, list)
+        else []
+    )
     if axes and len(axes) == len(given) and len({len(axis) for axis in axes}) > 1:
         raise _wrong(name, "has knots of another shape", expected, f"a list of {len(given)} arrays of knots")
     knots = np.array(as_number(name, "knots", given), dtype=float)
