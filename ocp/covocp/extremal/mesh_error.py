@@ -89,10 +89,10 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     """
     st = extremal.statement
     cost = _cost_of_all(extremal, running, within)
-    change, missed, moved = _change(extremal, running, 2, within)
+    change, missed, moved = changed(extremal, running, 2, within)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
-            further = _change(extremal, running, MANY_PARTS, within)
+            further = changed(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
     moves = not st.autonomous
@@ -119,11 +119,11 @@ def _share(change: float, missed: float, cost: float) -> float:
 def _unlike_halves(
     extremal: Extremal, running: float, within: Within | None, numbers: tuple[int, ...] = UNLIKE_HALVES
 ) -> list[tuple[float, float, float]]:
-    """`_change` by parts of a step that see what its halves do not, where there may be such; those that are finite."""
+    """Changes by parts of a step that see what its halves do not, where there may be such; those that are finite."""
     if not changes_within_steps(extremal):
         return []
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_change(extremal, running, parts, within) for parts in numbers]
+        found = [changed(extremal, running, parts, within) for parts in numbers]
     return [changes for changes in found if np.isfinite(changes).all()]
 
 
@@ -163,10 +163,10 @@ def unseen(
     """
     if not changes_within_steps(extremal):
         return None
-    st, running = extremal.statement, _parted(extremal, 1).running
+    st, running = extremal.statement, parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
-        told = _share(*_change(extremal, running, 2, within)[:2], cost)
+        told = _share(*changed(extremal, running, 2, within)[:2], cost)
         others_say = _unlike_halves(extremal, running, within, numbers)
         paid = max((_share(*changes[:2], cost) for changes in others_say), default=0.0)
         (halves, size), others = _by_segments(extremal, gaps), [_by_segments(extremal, gaps, n)[0] for n in numbers]
@@ -187,10 +187,10 @@ def _entry(statement: Statement, row: int) -> str:
     return next((b.name for b in blocks if b.span.start <= row - statement.nx < b.span.stop), "")
 
 
-def _change(extremal: Extremal, running: float, parts: int, within: Within | None = None) -> tuple[float, float, float]:
+def changed(extremal: Extremal, running: float, parts: int, within: Within | None = None) -> tuple[float, float, float]:
     """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    finer = _parted(extremal, parts)
+    finer = parted(extremal, parts)
     jumps = finer.jumps
     weights = extremal.multipliers.gaps
     if weights.shape != jumps.shape:  # a method without segments
@@ -208,10 +208,10 @@ def _change(extremal: Extremal, running: float, parts: int, within: Within | Non
 
 def _halved(extremal: Extremal) -> Refined:
     """The run with steps of half the length."""
-    return _parted(extremal, 2)
+    return parted(extremal, 2)
 
 
-def _parted(extremal: Extremal, parts: int) -> Refined:
+def parted(extremal: Extremal, parts: int) -> Refined:
     """The run with each step in so many parts."""
     given = extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist())
     return _halved_run(*given) if parts == 2 else _parted_run(*given, parts)
@@ -270,7 +270,7 @@ def _by_halves(extremal: Extremal, gaps: Array | float) -> float:
 
 def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tuple[Array, Array]:
     """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
-    t, finer = extremal.trajectory, _parted(extremal, parts)
+    t, finer = extremal.trajectory, parted(extremal, parts)
     scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
     rounded = ROUNDOFF * magnitude.max(initial=0.0)
@@ -398,7 +398,7 @@ def _divided(
 
 def _error_of_one(extremal: Extremal) -> float:
     """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
-    running = _parted(extremal, 1).running
+    running = parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, None)
     return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
 

@@ -65,7 +65,7 @@ def mention_doubts(solution: Solution) -> None:
     elif not (error <= COARSE_MESH or by_steps):
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
-            + (", or the states. Put a node where a rate jumps, if one does (grid=). " if depends_on_time else ". ")
+            + (f", or the states. {_node(solution)}" if depends_on_time else ". ")
             + ("U" if solution.method == METHOD else "Let refine=1e-4 put nodes where they are needed, or u")
             + "se more intervals or substeps."
         )
@@ -91,6 +91,13 @@ def mention_doubts(solution: Solution) -> None:
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             f"{other}more intervals."
         )
+
+
+def _node(solution: Solution) -> str:
+    """What helps where a rate may jump with the time within the steps, a sentence; "" where they are only too long."""
+    from covocp.extremal.step_order import is_smooth
+
+    return "" if is_smooth(solution.extremal, solution.within) else "Put a node where a rate jumps (grid=). "
 
 
 def mention_form(

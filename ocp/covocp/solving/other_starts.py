@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 # A run has lost its way after so many iterates in a row whose cost is below that of the first one by more than so many
 # times its size, and which violate less than this (scaled): far below any optimum, and not on the way back to one.
 LOST, TIMES, NEAR = 10, 10.0, 0.1
+# Iterations of runs from the own start: what finds a way from there mostly takes fewer, and where the conditions
+# contradict a run without a guess, with all that it tries, may take ten times as long as one that fails from a guess.
+MOST_ITERATIONS = 300
 ALONG, OWN = "the best gain along it", "the own start"
 
 # An outcome, and the best gain's solution where one was made.
@@ -135,7 +138,8 @@ class OtherStarts(ClassicalRuns):
             return self._from_guess(values, lambda *_, **__: (first, start), None, reporter, assess=assess)
 
         def own() -> Found:
-            return self._from_guess(values, gain_start, None, reporter, assess=assess)
+            most = Progress("", show=False, iterations=MOST_ITERATIONS, within=reporter)
+            return self._from_guess(values, gain_start, None, most, assess=assess)
 
         if self._otherwise:
             yield ALONG, along

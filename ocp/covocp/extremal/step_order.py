@@ -1,0 +1,27 @@
+"""Whether steps that are too long close in on the right result as they do where nothing jumps within them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.links import Within
+from covocp.extremal.mesh_error import changed, parted
+
+# Parts of a step, each half as long as that before, and the share of the change by one of them that the next one may
+# make where nothing jumps: steps of fourth order make a sixteenth, and a rate that jumps a sixth or more.
+PARTS, SHARE = (2, 4, 8), 0.1
+
+
+def is_smooth(extremal: Extremal, within: Within | None = None) -> bool:
+    """Whether nothing jumps within the steps: what halving them changes is by far less with each further time.
+
+    Args:
+        extremal: the trajectory.
+        within: what the rest of a chain says of it.
+    """
+    running = parted(extremal, 1).running
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = np.array([changed(extremal, running, parts, within) for parts in PARTS])
+        steps = np.abs(np.diff(np.vstack([np.zeros(found.shape[1]), found]), axis=0))[:, [0, 2]]  # of cost and states
+        return bool((steps[1:] <= SHARE * steps[:-1]).all())
