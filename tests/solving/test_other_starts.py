@@ -13,29 +13,6 @@ from covocp.solving import solver as solving
 QUIET = {"progress": False}
 
 
-def walled() -> co.Problem:
-    """A position that shall be at 1 beside a wall at 1.3, kept with 95 %, by a gain that is chosen freely."""
-    problem = co.Problem(4.0, "wall")
-    x, w = (problem.state(name, initial=0.0, variance=0.01) for name in ("x", "w"))
-    u, price = problem.control("u"), problem.parameter("price", 0.1)
-    problem.dynamics(x, w)
-    problem.dynamics(w, u - 0.3 * w, noise=0.02)
-    problem.measurement("y", x, noise=0.01)
-    problem.minimize_expected(running=price * u**2 + 0.5 * (x - 1) ** 2 + 0.1 * w**2, terminal_weight={x: 2.0})
-    problem.chance(x, upper=1.3, probability=0.95, name="wall")
-    return problem
-
-
-def test_a_free_gain_is_solved_again_from_a_plan_for_another_price():
-    """It was a SolveError after 1000 iterations; the cold solve of a fresh solver says what it is."""
-    solver = co.Solver(walled())
-    plan = solver.solve({"price": 1.0}, **QUIET)
-    found = solver.solve({"price": 0.5}, guess=plan, **QUIET)
-    expected = co.Solver(walled()).solve({"price": 0.5}, **QUIET)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-5)
-    assert found.cost == pytest.approx(0.932408, rel=1e-5)  # by Gauss steps, and by a limited-memory Hessian
-
-
 def braking() -> co.Problem:
     """A double integrator to rest with least energy from 1 m in 2 s: the integral of u^2 is 12 / 2^3."""
     problem = co.Problem(2.0)
