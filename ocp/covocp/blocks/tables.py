@@ -154,12 +154,9 @@ def table(name: str, grid: Given, values: Given, *, kind: Literal["linear", "cub
 def _knots(name: str, given: Given, kind: str) -> Array:
     """Knots of one variable, checked."""
     expected = "shape (K,); of several variables a tuple of such, not a list or an array"
-    axes = (
-        [a for a in given if isinstance(a, (list, tuple, np.ndarray)) and np.iterable(a)]
-        if isinstance(given, list)
-        else []
-    )
-    if axes and len(axes) == len(given) and len({len(axis) for axis in axes}) > 1:
+    axes = given if isinstance(given, list) else []
+    several = all(isinstance(axis, (list, tuple, np.ndarray)) and np.iterable(axis) for axis in axes)
+    if several and len({len(axis) for axis in axes}) > 1:
         raise _wrong(name, "has knots of another shape", expected, f"a list of {len(given)} arrays of knots")
     knots = np.array(as_number(name, "knots", given), dtype=float)
     if knots.ndim != 1:

@@ -89,10 +89,10 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     """
     st = extremal.statement
     cost = _cost_of_all(extremal, running, within)
-    change, missed, moved = changed(extremal, running, 2, within)
+    change, missed, moved = changes_by_parts(extremal, running, 2, within)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
-            further = changed(extremal, running, MANY_PARTS, within)
+            further = changes_by_parts(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
     moves = not st.autonomous
@@ -123,7 +123,7 @@ def _unlike_halves(
     if not changes_within_steps(extremal):
         return []
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [changed(extremal, running, parts, within) for parts in numbers]
+        found = [changes_by_parts(extremal, running, parts, within) for parts in numbers]
     return [changes for changes in found if np.isfinite(changes).all()]
 
 
@@ -166,10 +166,10 @@ def unseen(
     st, running = extremal.statement, parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
-        told = _share(*changed(extremal, running, 2, within)[:2], cost)
+        told = _share(*changes_by_parts(extremal, running, 2, within)[:2], cost)
         others_say = _unlike_halves(extremal, running, within, numbers)
         paid = max((_share(*changes[:2], cost) for changes in others_say), default=0.0)
-        (halves, size), others = _by_segments(extremal, gaps), [_by_segments(extremal, gaps, n)[0] for n in numbers]
+        (halves, size), others = by_segments(extremal, gaps), [by_segments(extremal, gaps, n)[0] for n in numbers]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
     paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST and not np.any(gaps) else 0.0
@@ -187,7 +187,9 @@ def _entry(statement: Statement, row: int) -> str:
     return next((b.name for b in blocks if b.span.start <= row - statement.nx < b.span.stop), "")
 
 
-def changed(extremal: Extremal, running: float, parts: int, within: Within | None = None) -> tuple[float, float, float]:
+def changes_by_parts(
+    extremal: Extremal, running: float, parts: int, within: Within | None = None
+) -> tuple[float, float, float]:
     """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     finer = parted(extremal, parts)
@@ -258,7 +260,7 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
 
 def _by_halves(extremal: Extremal, gaps: Array | float) -> float:
     """`node_error` by halves of the steps alone."""
-    moved, size = _by_segments(extremal, gaps)
+    moved, size = by_segments(extremal, gaps)
     with np.errstate(over="ignore", invalid="ignore"):
         left = None if np.any(gaps) else _departure(extremal, moved, size)
         if left is not None:
@@ -268,7 +270,7 @@ def _by_halves(extremal: Extremal, gaps: Array | float) -> float:
         return float((moved / size).max(initial=0.0))
 
 
-def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tuple[Array, Array]:
+def by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tuple[Array, Array]:
     """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
     t, finer = extremal.trajectory, parted(extremal, parts)
     scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
@@ -282,17 +284,6 @@ def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tup
         left = np.abs(inside[-1, t.x.shape[1] :]) / np.maximum(final_deviations(extremal.statement, t.e), rounded)
         total[t.x.shape[1] :] = np.maximum(total[t.x.shape[1] :], left * size[t.x.shape[1] :])
     return total, size
-
-
-def moved_by_halves(extremal: Extremal) -> float:
-    """Largest change of a state by halving the steps, in its range; inf where something is not finite with them."""
-    finer, nx = _halved(extremal), extremal.statement.nx
-    if not all(np.isfinite(v).all() for v in (finer.jumps, finer.states, finer.matrices, finer.running)):
-        return float("inf")
-    moved, size = _by_segments(extremal, 0.0)
-    with np.errstate(all="ignore"):
-        shares = np.where(moved[:nx] > 0.0, moved[:nx] / size[:nx], 0.0)
-    return float(np.where(np.isnan(shares), np.inf, shares).max(initial=0.0))
 
 
 def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
@@ -315,7 +306,7 @@ def unstable(extremal: Extremal) -> tuple[float, float | None] | None:
     Returns:
         None where the plant is not seen to be unstable, the cost None where it is not known.
     """
-    moved, size = _by_segments(extremal, 0.0)
+    moved, size = by_segments(extremal, 0.0)
     left = _departure(extremal, moved, size)
     if left is None or left.cost is None:
         return None
@@ -373,7 +364,7 @@ def _divided(
     """`finer_steps`, of at most so many times as many, for so many times less change."""
     statement, mesh = extremal.statement, extremal.mesh
     order = 2 if mesh.step == "strang" else ORDER
-    moved, size = _by_segments(extremal, gaps)
+    moved, size = by_segments(extremal, gaps)
     times = (
         max(float((moved / size).max(initial=0.0)), _against_growth(extremal, gaps, allowed, margin, order)) / allowed
     )

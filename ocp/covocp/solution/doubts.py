@@ -13,16 +13,7 @@ from covocp.extremal.coarse_controls import cost_of_form
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.links import Within
-from covocp.extremal.mesh_error import (
-    COARSE_MESH,
-    LONG_STEPS,
-    OPTIMISED,
-    Unseen,
-    moved_by_halves,
-    node_error,
-    unseen,
-    unstable,
-)  # fmt: skip
+from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.origin import METHOD
@@ -210,6 +201,8 @@ def _unknown_error(solution: Solution) -> str:
         f"{said}with integration steps of half the length a state, a covariance or the cost becomes NaN or inf. Use "
         "more intervals or substeps."
     )
+    from covocp.extremal.step_order import moved_by_halves
+
     if solution.statement is not None and np.isinf(moved_by_halves(solution.extremal)):
         return halves
     costates = np.hstack([solution.costates.state, solution.costates.matrices])

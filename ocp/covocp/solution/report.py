@@ -412,7 +412,7 @@ def _effort(solution: Solution) -> Section:
     if stats.get(OTHERWISE):
         effort.append(f"{'found' if solution.converged else 'nor found'} by {stats[OTHERWISE]}")
     if stats.get(OTHER_START):
-        effort.append(f"the guess led nowhere, {stats[OTHER_START]} to this")
+        effort.append(f"the guess led nowhere, solved from {stats[OTHER_START]}")
     if stats.get("tried", 1) > 1 and solution.within is None:
         effort.append(f"{stats['tried']} starts tried")
     if "untried" in stats and solution.within is None:

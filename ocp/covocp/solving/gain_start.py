@@ -54,12 +54,11 @@ LARGEST_SPREAD, SPREADS = 1e4, 40
 ROUNDOFF = 1e-9
 
 
-# What the user gave and who is told of iterations -> the solution with the best gain, and what a run starts from.
 class GainStart(Protocol):
-    """What makes it; `along`: also where a solution is given, from there."""
+    """What makes the solution with the best gain, and what a run starts from."""
 
     def __call__(self, guess: Given, reporter: Progress, *, along: bool = ...) -> tuple[Solution | None, Given]:
-        """Both."""
+        """Both, from what the user gave; `along`: also where that is a solution, from there."""
 
 
 def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:

@@ -16,7 +16,8 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import NOT_FINITE
-from covocp.extremal.mesh_error import mesh_error, moved_by_halves
+from covocp.extremal.mesh_error import mesh_error
+from covocp.extremal.step_order import moved_by_halves
 from covocp.transcription.first_guess import diverges
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, Options
 
