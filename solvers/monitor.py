@@ -19,6 +19,9 @@ from covocp.transcription.program import Program
 PATIENCE = 40
 PROGRESS = 0.9
 NEAR = 1e-3
+# Largest violation, in units of its row, from which on a run has gone away. One that stays there for so many iterations
+# without that progress does not come back: none is known that did.
+AWAY, ASTRAY = 30.0, 100
 # A run crawls after so many steps that are the same but for this share. The Hessian of limited memory is then the first
 # one, the identity: pairs without positive curvature are left out, and steps are unit steps along the gradient.
 SAME_STEPS, SAME = 8, 0.02
@@ -76,7 +79,8 @@ class Monitor(ca.Callback):
         self._scale, self._iteration = 1.0, 0
         self._bounds: dict[str, Array] = {}
         self._impatient, self.wandered = False, False
-        self._least, self._since = np.inf, 0
+        self.astray = False
+        self._least, self._since, self._away = np.inf, 0, 0
         self._steps, self._crawling, self.crawled = _Steps(), False, False
         self._patience: int | None = None
         self.spent = False  # that patience
@@ -103,8 +107,8 @@ class Monitor(ca.Callback):
             patience: iterations after which one is; None: those that the solver allows.
         """
         self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
-        self._impatient, self.wandered = impatient, False
-        self._least, self._since = np.inf, 0
+        self._impatient, self.wandered, self.astray = impatient, False, False
+        self._least, self._since, self._away = np.inf, 0, 0
         self._steps, self._crawling, self.crawled = _Steps(), crawling, False
         self._patience, self.spent = patience, False
         self.best = None
@@ -153,13 +157,13 @@ class Monitor(ca.Callback):
         self._iteration += 1
         self.crawled = self._crawling and self._steps.same(w) >= SAME_STEPS
         self.spent = self._patience is not None and self._iteration > self._patience
-        return self._progress.stop or self.crawled or self.spent or self._wanders(violation)
+        return self._progress.stop or self.crawled or self.spent or self._is_lost(violation)
 
-    def _wanders(self, violation: float) -> bool:
-        """Whether a run that need not be finished has made no progress for long."""
-        if not self._impatient:
-            return False
+    def _is_lost(self, violation: float) -> bool:
+        """Whether a run has made no progress for long that is far away, or that need not be finished."""
+        self._away = self._away + 1 if violation > AWAY else 0
         if violation < PROGRESS * self._least:
-            self._least, self._since = violation, self._iteration
-        self.wandered = violation > NEAR and self._iteration - self._since >= PATIENCE
-        return self.wandered
+            self._least, self._since, self._away = violation, self._iteration, 0
+        self.astray = self._away >= ASTRAY
+        self.wandered = self._impatient and violation > NEAR and self._iteration - self._since >= PATIENCE
+        return self.wandered or self.astray

@@ -288,6 +288,8 @@ class Runs:
             best = self._monitor.best
             w, lam_x, lam_g = best.w, best.lam_x, best.lam_g
         success, status = bool(stats["success"]), str(stats.get("return_status", ""))
+        if self._monitor is not None and self._monitor.astray:
+            status = Status.DIVERGING.name_of_ipopt
         evaluable = True
         try:
             where = nlp.unpack(w, parameters)

@@ -7,7 +7,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import solve_bvp, solve_ivp
 
 import covocp as co
 from covocp.extremal.mesh_error import node_error
@@ -332,3 +332,58 @@ def test_a_sine_at_whose_zeros_the_steps_meet_it_is_no_magnitude(frequency, meth
     ocp.minimize(running=u**2 + 0.1 * (x - 1) ** 2)
     found = co.solve(ocp, method=method, intervals=INTERVALS, progress=False)
     assert found.cost == pytest.approx(best_cost(frequency), rel=2e-4)
+
+
+def lag_of_periods(frequency: float) -> co.Problem:
+    """A lag that is kept at rest while it is shaken: steps that meet each period at its zeros find nothing to do."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u - 0.5 * x + ca.sin(2 * np.pi * frequency * ocp.time))
+    ocp.minimize(running=0.1 * u**2 + x**2)
+    return ocp
+
+
+def least_cost(frequency: float) -> float:
+    """By the two-point boundary value problem of x, its costate, and the cost."""
+
+    def rates(t, y):
+        x, p = y[:2]
+        shake = np.sin(2 * np.pi * frequency * t)
+        return np.vstack([-0.5 * x - 5.0 * p + shake, 0.5 * p - 2.0 * x, 2.5 * p**2 + x**2])
+
+    t = np.linspace(0.0, 2.0, round(80 * frequency) + 1)
+    found = solve_bvp(rates, lambda a, b: np.array([a[0], b[1], a[2]]), t, np.zeros((3, t.size)), tol=1e-4)
+    assert found.success
+    return float(found.y[2, -1])
+
+
+@pytest.mark.parametrize("options", [{}, {"control": "constant"}, {"method": "gradient"}])
+def test_where_the_steps_see_nothing_of_what_costs_they_are_shortened(options):
+    """A run on them has no more than roundoff to minimise, and fails of it: 2e-21 is no cost to be had."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the mesh, whose error is told
+        solution = co.solve(lag_of_periods(10.0), intervals=20, progress=False, **options)
+    error = abs(solution.cost / least_cost(10.0) - 1.0)
+    assert error < 0.03
+    assert error < 4.0 * (solution.mesh_error + solution.optimality.control_error)
+
+
+def test_a_state_that_long_steps_move_where_nothing_costs_is_no_error_of_the_cost():
+    """A lag that is asked for at a moment alone: it dies out in one long interval, of which halves tell the state."""
+    ocp = co.Problem(10.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    weight = ocp.data("weight", np.array([0.0, 4.97, 5.0, 5.03, 10.0]), np.array([0.0, 0.0, 50.0, 0.0, 0.0]))
+    ocp.dynamics(x, u - 0.5 * x)
+    ocp.minimize(running=0.1 * u**2 + weight * (x - 1) ** 2)
+    grid = np.concatenate([np.linspace(0.0, 0.497, 40), np.linspace(0.497, 0.503, 13)[1:], [0.6, 1.0]])
+    with pytest.warns(co.CovocpWarning, match="moves a state by .* between two nodes, and the cost by") as told:
+        solution = co.solve(ocp, grid=grid, substeps=1, progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        finer = co.solve(ocp, grid=grid, substeps=8, progress=False)
+        printed = str(solution)
+    assert "substeps" in str(told[0].message)
+    assert "refine" not in str(told[0].message)
+    assert solution.cost == pytest.approx(finer.cost, rel=2e-4)
+    assert solution.mesh_error > 2e-4
+    assert "cost, or states between nodes" in printed

@@ -26,9 +26,9 @@ def brisk(limit=1.2):
     return ocp
 
 
-def passed(solution):
-    """By how much v + z sqrt(E_vv + Xhat_vv), z the quantile of 98 %, passes 1.2 at the nodes."""
-    deviation = np.sqrt(solution["E"][:, 1, 1] + solution["Xhat"][:, 1, 1])
+def passed(solution, gap=0.0):
+    """By how much v + z sqrt(E_vv + Xhat_vv + gap), z the quantile of 98 %, passes 1.2 at the nodes."""
+    deviation = np.sqrt(solution["E"][:, 1, 1] + solution["Xhat"][:, 1, 1] + gap)
     return float((np.ravel(solution["v"]) + 2.0537489 * deviation).max()) - 1.2
 
 
@@ -75,14 +75,13 @@ def test_other_plugins_and_methods_keep_their_own_iterations():
 def test_at_a_limit_inside_a_loosened_run_the_best_point_counts(monkeypatch):
     """With what it violates of the limit itself."""
     monkeypatch.setattr(solver, "PATIENCE", 2)  # the first run ends early, and far away
-    first, later = (
-        co.Solver(brisk(), intervals=30).solve(iteration_limit=limit, progress=False) for limit in (31, 100)
-    )
+    first, later = (co.Solver(brisk(), intervals=30).solve(iteration_limit=limit, progress=False) for limit in (31, 80))
     assert not later.converged
-    assert later.message == "stopped at the limit of 100 iterations"
-    assert later.stats["iterations"] > first.stats["iterations"] + 50  # of all runs
+    assert later.message == "stopped at the limit of 80 iterations"
+    assert later.stats["iterations"] > first.stats["iterations"] + 10  # of all runs
     assert max(later.violations.values()) < 0.3 * max(first.violations.values())
-    assert later.violations["speed"] == pytest.approx(passed(later), rel=1e-5)
+    gap = later.violations["continuity of Xhat[v, v]"]  # before or after it the limit is passed
+    assert passed(later) < later.violations["speed"] < passed(later, gap)
 
 
 def test_a_solution_under_wider_limits_is_not_one_of_the_problem(monkeypatch):

@@ -67,7 +67,7 @@ ROUND = 10
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
 
-def mesh_error(extremal: Extremal, running: float, within: Within | None = None) -> float:
+def mesh_error(extremal: Extremal, running: float, within: Within | None = None, *, of_states: bool = True) -> float:
     """Relative change of the cost by halving the integration steps, to first order.
 
     Where rates depend on the time explicitly, they may jump: then that of the states over a segment, where it is more.
@@ -83,6 +83,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
         running: its running cost.
         within: what the rest of a chain says of it: the cost is then that of all, with what its end changes of the
             later ones, at best and along their controls.
+        of_states: whether what states move by counts where it may.
 
     Returns:
         |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
@@ -95,7 +96,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             further = changes_by_parts(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
-    moves = not st.autonomous
+    moves = of_states and not st.autonomous
     if moves and not np.isfinite(moved):
         return error
     error, hidden = (max(error, moved) if moves else error), 0.0
@@ -172,7 +173,9 @@ def unseen(
         (halves, size), others = by_segments(extremal, gaps), [by_segments(extremal, gaps, n)[0] for n in numbers]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
-    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST and not np.any(gaps) else 0.0
+    # what is not seen may be all that costs
+    most = max([abs(cost), *(abs(cost + changes[0]) for changes in others_say)])
+    paid = paid if paid > MORE_THAN_HALVES * told and most > NO_COST and not np.any(gaps) else 0.0
     worst = int(np.argmax(moved))
     if not moved[worst] and not paid:
         return None
@@ -388,10 +391,11 @@ def _divided(
 
 
 def _error_of_one(extremal: Extremal) -> float:
-    """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
+    """`mesh_error` of a statement by itself; 0 where it costs nothing by shorter steps too, or that is no number."""
     running = parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, None)
-    return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
+    most = max(abs(cost), abs(cost + changes_by_parts(extremal, running, 2)[0]))
+    return float(np.nan_to_num(mesh_error(extremal, running))) if most > NO_COST else 0.0
 
 
 def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:

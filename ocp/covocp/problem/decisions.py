@@ -16,7 +16,9 @@ from covocp.problem.declarations import Declarations, Dynamics, State
 from covocp.problem.matrices import Matrix
 
 
-def with_constant(own: Declarations, symbol: dict[str, Any], lower: Given, upper: Given, guess: Given) -> Declarations:
+def with_constant(
+    own: Declarations, symbol: dict[str, Any], lower: Given, upper: Given, guess: Given, *, sized: bool = True
+) -> Declarations:
     """The declarations with one more constant that is chosen.
 
     Args:
@@ -25,6 +27,7 @@ def with_constant(own: Declarations, symbol: dict[str, Any], lower: Given, upper
         lower: bounds, numbers or one for each component.
         upper: likewise.
         guess: where it starts, likewise.
+        sized: whether guess and bounds tell its magnitude.
 
     Raises:
         ProblemError: bounds crossed, the guess NaN, infinite or outside of them.
@@ -41,7 +44,7 @@ def with_constant(own: Declarations, symbol: dict[str, Any], lower: Given, upper
         lower=low,
         upper=high,
         guess=start,
-        scale=_magnitude(start, low, high),
+        scale=_magnitude(start, low, high) if sized else None,
         variance=ca.MX(size, size),
         role="decision",
     )

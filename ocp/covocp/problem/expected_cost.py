@@ -352,7 +352,7 @@ def _with_free_gain(
     own: dict[str, Any] = {"name": GAIN, "symbol": symbol, "size": int(where.size), "where": place, "unit": ""}
     lower, upper, start = (values.ravel(order="F")[where] for values in (low, high, guess))
     if gain.constant:
-        problem = with_constant(problem, own, lower, upper, start)
+        problem = with_constant(problem, own, lower, upper, start, sized=False)
     else:
         problem = problem.adding(controls=Control(**own, lower=lower, upper=upper, guess=start, scale=None))
     estimate = declare_matrix(

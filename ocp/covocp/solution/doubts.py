@@ -13,7 +13,16 @@ from covocp.extremal.coarse_controls import cost_of_form
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.links import Within
-from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
+from covocp.extremal.mesh_error import (
+    COARSE_MESH,
+    LONG_STEPS,
+    OPTIMISED,
+    Unseen,
+    mesh_error,
+    node_error,
+    unseen,
+    unstable,
+)
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.origin import METHOD
@@ -43,7 +52,6 @@ REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or 
 def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
     error, fine, jumps = solution.mesh_error, False, mention_jumps(solution)
-    depends_on_time = solution.statement is not None and not solution.statement.autonomous
     alone, by_steps = _flown_alone(solution) if np.isfinite(error) and not jumps else ("", False)
     if alone:
         warn_user(alone)
@@ -54,12 +62,7 @@ def mention_doubts(solution: Solution) -> None:
     elif jumps and not coarse_elsewhere(solution, jumps):
         pass  # the steps are long where it jumps, and no others are right there
     elif not (error <= COARSE_MESH or by_steps):
-        warn_user(
-            f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
-            + (f", or the states. {_node(solution)}" if depends_on_time else ". ")
-            + ("U" if solution.method == METHOD else "Let refine=1e-4 put nodes where they are needed, or u")
-            + "se more intervals or substeps."
-        )
+        warn_user(_coarse(solution, error))
     elif alone:
         pass  # said already, with what the steps are off at the nodes
     elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
@@ -82,6 +85,23 @@ def mention_doubts(solution: Solution) -> None:
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             f"{other}more intervals."
         )
+
+
+def _coarse(solution: Solution, error: float) -> str:
+    """What shorter integration steps change, and what helps."""
+    statement, remedy = solution.statement, "Use more intervals or substeps."
+    if solution.method != METHOD and "refine" not in solution.stats:
+        remedy = "Let refine=1e-4 put nodes where they are needed, or use more intervals or substeps."
+    changes, node = f"changes the cost by {error:.1e} (relative)", ""
+    if statement is not None and not statement.autonomous:
+        node = _node(solution)
+        paid = mesh_error(solution.extremal, solution.cost_terms["running"], solution.within, of_states=False)
+        if paid <= COARSE_MESH:
+            moves = (
+                f"moves a state by {error:.1e} of its range between two nodes, and the cost by {paid:.1e} (relative)"
+            )
+            return f"The integration steps are long: halving them {moves}. {node}Use more substeps (substeps=)."
+    return f"The mesh is too coarse: halving the integration steps {changes}. {node}{remedy}"
 
 
 def _node(solution: Solution) -> str:

@@ -33,7 +33,8 @@ RESIDUALS = {
     "conservation": "variances E + Xhat that no control changes: error (relative)",
     "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
 }
-
+# The change where rates depend on the time: halves may miss in the cost what they see in the states.
+OR_STATES = "cost, or states between nodes: change by halving the steps (relative)"
 
 # Of costates that nothing is compared with.
 UNCHECKED = "not checked: explicit steps back would be too many; costates near the end may be off"
@@ -89,12 +90,20 @@ def residual_section(solution: Solution) -> Section:
             continue
         rows.append(
             [
-                RESIDUALS.get(name, name.replace("_", " ")),
+                _words(solution, name),
                 "-" if np.isnan(value) else f"{value:.2e}",
                 _verdict(solution, name, value),
             ]
         )
     return [Table(columns=["necessary conditions", "", ""], rows=rows, words=(0, 2))]
+
+
+def _words(solution: Solution, name: str) -> str:
+    """What a residual is of."""
+    statement = solution.statement
+    if name == "mesh_error" and statement is not None and not statement.autonomous:
+        return OR_STATES
+    return RESIDUALS.get(name, name.replace("_", " "))
 
 
 def _verdict(solution: Solution, name: str, value: float) -> str:

@@ -12,6 +12,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
+from covocp.extremal.unseen import changes_within_steps
 from covocp.solution.solution import Solution
 from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import cost_of, counted, from_starts, with_stats
@@ -126,9 +127,13 @@ class ClassicalRuns:
         return np.nan, f"The problem without noise was not solved: {outcome.message}."
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
-        while self._own_steps and outcome.converged and not reporter.stop:
-            finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
+        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs.
+
+        A run that fails may have missed what changes within the steps: of a disturbance of which they see nothing no
+        more than roundoff is left to minimise.
+        """
+        while self._own_steps and not reporter.stop:
+            finer = self._finer_for(outcome)
             if finer is None:
                 break
             again = self._at_once_by(finer, outcome, values, reporter)
@@ -137,6 +142,16 @@ class ClassicalRuns:
                 break
             outcome = again
         return outcome
+
+    def _finer_for(self, outcome: Outcome) -> Options | None:
+        """Options with the shorter steps that an outcome needs, one that failed where the model is faster than these."""
+        try:
+            if outcome.converged or changes_within_steps(outcome.extremal):
+                return finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
+        except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):
+            if outcome.converged:
+                raise
+        return None  # or there are no values where it ended
 
     def _at_once_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
         """What was found from the deterministic cost at once, by shorter steps; None where a run must tell."""

@@ -14,13 +14,12 @@ import numpy as np
 from covocp.base.errors import CovocpError
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.solvers.monitor import AWAY
 from covocp.solvers.plugins import merged
 from covocp.solving.attempts import counted, from_starts, merit_of, with_stats
 from covocp.solving.failure import with_stalled
 
-# Largest violation, in units of its row, from which on a run has gone away; and shares of the usual largest violation
-# that the steps of others may end at: the filter of Ipopt refuses more.
-AWAY = 30.0
+# Shares of the usual largest violation that steps may end at: the filter of Ipopt refuses more.
 NEAR = (1e-1, 1e-2)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices, unpack
 from covocp.statement.statement import Block, Statement
+from covocp.transcription.before_reading import GAIN
 from covocp.transcription.first_guess import evaluate_guess, simulated
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
@@ -38,6 +39,8 @@ GIVEN_SHARE = 1e-6
 WIDE_BOUNDS = 1e3
 # What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
 NOTHING = 1e-50
+# By how much more than it does a gain may let the control scatter in its units: a start knows less than it will do.
+SCATTER = 2.0
 # A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
 ROUNDOFF = 1e-24
 
@@ -90,7 +93,8 @@ def magnitudes(
         own = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
         size = np.minimum(np.where(own > NOTHING, own, 1.0), _half_range(statement, block))
         u[block.span] = _as_given(statement, block, size, own > NOTHING, reached)
-    return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+    found_scales = Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+    return _with_gain(statement, guess, found_scales)
 
 
 def unvanishing(
@@ -119,6 +123,9 @@ def unvanishing(
     lower, upper = statement.state_bounds
     half = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), 0.0)
     told = np.maximum(told, np.minimum(half, wide * np.where(told > NOTHING, told, 1.0)))
+    for block in statement.states:
+        if block.name == GAIN and GAIN not in statement.scales:
+            told[block.span] = magnitudes(statement, found, parameters, reached=True).x[block.span]
     return np.asarray(np.maximum(np.abs(found.x).max(axis=0, initial=0.0), np.where(told > NOTHING, told, 1.0)))
 
 
@@ -158,7 +165,46 @@ def choose_scales(
             own = np.where(np.isfinite(half), np.maximum(own, least), own)
         own = np.minimum(own, half)
         u[block.span] = _as_given(statement, block, own, own > 0, reached)
-    return replace(scales, u=u)
+    return _with_gain(statement, guess, replace(scales, u=u))
+
+
+def _with_gain(statement: Statement, guess: Trajectory, scales: Scales) -> Scales:
+    """The same with a gain that is chosen freely in units of controls and states: it moves nothing of the nominal.
+
+    Each entry by itself lets the control scatter as much as the largest one does; where all are zero, as much as the
+    nominal control is.
+    """
+    blocks = [b for b in (*statement.controls, *statement.states) if b.name == GAIN]
+    if statement.loop is None or not blocks or GAIN in statement.scales:
+        return scales
+    gain, count = blocks[0], statement.loop.gain.size1_out(0)
+    constant = gain.kind == "state"
+    along, (lower, upper) = (guess.x, statement.state_bounds) if constant else (guess.u, statement.control_bounds)
+    entries, places = (np.array(v) for v in statement.loop.gain.jac_sparsity(0, int(not constant)).get_triplet())
+    inside = (places >= gain.span.start) & (places < gain.span.stop)
+    rows, columns = np.divmod(entries[inside][np.argsort(places[inside])], count)[::-1]
+    spread = _spread(statement, guess, scales.x)[columns]
+    scatter = np.abs(along[:, gain.span]).max(axis=0, initial=0.0) * spread
+    fed = scales.u if constant else np.delete(scales.u, np.arange(gain.span.start, gain.span.stop))
+    largest = np.array([scatter[rows == row].max(initial=0.0) for row in range(count)])
+    size = SCATTER * np.where(largest > NOTHING, largest, fed)[rows] / spread
+    half = 0.5 * (upper - lower)[gain.span]
+    size = np.where(np.isfinite(half) & (half > 0.0), np.minimum(size, half), size)
+    x, u = scales.x.copy(), scales.u.copy()
+    (x if constant else u)[gain.span] = size
+    return replace(scales, x=x, u=u)
+
+
+def _spread(statement: Statement, guess: Trajectory, x: Array) -> Array:
+    """Mean deviations of the rows of the augmented state along a guess; magnitudes of what does not deviate."""
+    sizes, variances = np.ones(len(statement.augmented)), np.zeros(len(statement.augmented))
+    for k, row in estimated_rows(statement).items():
+        sizes[row] = x[k]
+    for block in statement.matrices:
+        if block.size == variances.size:
+            rows, columns = half_indices(block.size)
+            variances += np.abs(guess.e[:, block.span][:, rows == columns]).mean(axis=0)
+    return np.where(variances > NOTHING, np.sqrt(variances), sizes)
 
 
 def with_given(statement: Statement, scales: Scales) -> Scales:

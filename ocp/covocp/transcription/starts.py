@@ -20,6 +20,7 @@ from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
+from covocp.transcription.before_reading import GAIN
 from covocp.transcription.choosing import IMPLICIT_SUBSTEPS
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import (
@@ -159,6 +160,9 @@ def _units_beside(statement: Statement, mesh: Mesh, parameters: Array, guessed: 
         units[block.span] = statement.scales.get(block.name, units[block.span])
         own = units[block.span]
         units[block.span] = np.where(own > 0, own, own.max())
+        if block.name == GAIN and block.name not in statement.scales:
+            at_first = Trajectory(x=x, u=flat, e=guessed[1][None, :], duration=statement.duration.guess)
+            units[block.span] = choose_scales(statement, mesh, at_first, parameters).x[block.span]
     return np.where(units > 0, units, 1.0)
 
 
