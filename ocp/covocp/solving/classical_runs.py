@@ -144,7 +144,7 @@ class ClassicalRuns:
         return outcome
 
     def _finer_for(self, outcome: Outcome) -> Options | None:
-        """Options with the shorter steps that an outcome needs, one that failed where the model is faster than these."""
+        """Options with the shorter steps that an outcome needs, a failed one where the model is faster than these."""
         try:
             if outcome.converged or changes_within_steps(outcome.extremal):
                 return finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
