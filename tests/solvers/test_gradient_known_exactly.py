@@ -16,7 +16,6 @@ from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Trajectory
 
 KNOWN = np.diag([0.0, 0.0, 1.0, 1.0, 0.1, 0.1])
-GUESS = {"u": [0.5, 0.5]}  # no other numbers of switches are tried, of which each is a run
 
 
 def tracking(start: tuple[float, float] = (0.0, 0.0)) -> co.Problem:
@@ -44,8 +43,8 @@ def tracking(start: tuple[float, float] = (0.0, 0.0)) -> co.Problem:
 )
 def test_states_that_are_known_exactly_from_elsewhere(moved: dict[str, Any], start: tuple[float, float]):
     """It had ended with 'the penalties do not remove the violations', of 1e-30, of the variance of s."""
-    found = co.Solver(tracking(), "gradient", intervals=40).solve(progress=False, guess=GUESS, **moved)
-    fresh = co.solve(tracking(start), intervals=40, guess=GUESS, progress=False)
+    found = co.Solver(tracking(), "gradient", intervals=40).solve(progress=False, **moved)
+    fresh = co.solve(tracking(start), intervals=40, progress=False)
     assert found.cost == pytest.approx(fresh.cost, rel=1e-6)
 
 

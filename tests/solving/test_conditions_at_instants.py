@@ -193,7 +193,7 @@ def test_a_variance_is_below_its_limit_at_the_instant() -> None:
     assert residuals.stationarity < 1e-7
     assert residuals.costate_difference < 1e-3
     assert residuals.hamiltonian_variation < 1e-5
-    gradient = co.solve(learning(0.05), "gradient", intervals=40, progress=False, **MOVING)
+    gradient = co.solve(learning(0.05), "gradient", intervals=40, progress=False)
     assert gradient.cost == pytest.approx(plain.cost, rel=3e-5)
     assert gradient.multiplier("learnt") == pytest.approx(plain.multiplier("learnt"), rel=3e-5)
 
