@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import covocp as co
 from covocp.solving import solver
 
-INTERVALS = {"intervals": 60, "progress": False}
+INTERVALS = {"intervals": 80, "progress": False}
 
 
 def lane(probability=None):
