@@ -20,7 +20,7 @@ FORMS = ("eliminated", "states")
 
 @pytest.fixture(scope="module")
 def both() -> dict[str, co.PhasesSolution]:
-    return {form: co.solve(bounce(), intervals=30, covariances=form, tolerance=1e-9, **QUIET) for form in FORMS}
+    return {form: co.solve(bounce(), intervals=40, covariances=form, tolerance=1e-9, **QUIET) for form in FORMS}
 
 
 @pytest.fixture(params=FORMS)
