@@ -84,14 +84,14 @@ class Loop:
 
 
 class Piecewise:
-    """Dense outputs one after the other."""
+    """Dense outputs one after the other, of all steps at once: most of the time is spent on looking values up."""
 
     def __init__(self, pieces):
-        self.ends = [piece.t_max for piece in pieces[:-1]]
-        self.pieces = pieces
+        self.steps = sorted((step for piece in pieces for step in piece.interpolants), key=lambda step: step.t_min)
+        self.ends = [step.t_max for step in self.steps[:-1]]
 
     def __call__(self, t):
-        return self.pieces[bisect_right(self.ends, t)](t)
+        return self.steps[bisect_right(self.ends, t)](t)
 
 
 def integrate(rate, start, times, tolerance):
@@ -109,7 +109,7 @@ def integrate(rate, start, times, tolerance):
         assert run.success, run.message
         pieces.append(run.sol)
         value = run.y[:, -1]
-    return Piecewise(pieces if times[-1] > times[0] else pieces[::-1]), value
+    return Piecewise(pieces), value
 
 
 def nominal(system, control, duration, *, breaks: Sequence[float] = ()):
@@ -207,16 +207,20 @@ def closed_loop(
     forward = nominal_and_filter(system, control, ends)
     backward = cost_to_go(system, control, ends, forward)
 
+    def at(t):
+        """x, S and u, and the gains K and C."""
+        ahead, S, u = forward(t), backward(t).reshape(n, n), as_vector(control, t)
+        x, E = ahead[:n], ahead[n:].reshape(n, n)
+        _, G, M, _, B, N = expansion(system, x, u)
+        K = E @ M.T @ U_inverse if filter is None else np.atleast_2d(filter(t))
+        return x, S, u, K, np.linalg.solve(B, G.T @ S + N.T) if feedback is None else np.atleast_2d(feedback(t))
+
     def gains(t):
         """K and C."""
-        x, E, S = forward(t)[:n], forward(t)[n:].reshape(n, n), backward(t).reshape(n, n)
-        _, G, M, _, B, N = expansion(system, x, as_vector(control, t))
-        K = E @ M.T @ U_inverse if filter is None else np.atleast_2d(filter(t))
-        return K, np.linalg.solve(B, G.T @ S + N.T) if feedback is None else np.atleast_2d(feedback(t))
+        return at(t)[3:]
 
     def loop(t, z):
-        x, S, u = forward(t)[:n], backward(t).reshape(n, n), as_vector(control, t)
-        return loop_rates(system, actual, x, S, u, *gains(t), *z[: 3 * n * n].reshape(3, n, n))
+        return loop_rates(system, actual, *at(t), *z[: 3 * n * n].reshape(3, n, n))
 
     first = np.concatenate([actual.variance.ravel(), np.zeros(2 * n * n + 5)])
     tolerance = ABSOLUTE * np.concatenate([np.tile(square.ravel(), 3), np.full(5, size)])

@@ -10,6 +10,7 @@ analytic in u and v. Behind the patch it is multiplied by exp(-(w / 0.15)^2), wh
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -104,7 +105,13 @@ class Patch:
 
     def function(self) -> ca.Function:
         """casadi.Function (quaternion, source) -> (power, gradient in body axes)."""
-        quaternion, source, phi = ca.SX.sym("quaternion", 4), ca.SX.sym("source", 3), ca.SX.sym("phi", 3)
-        power = self.power(so3.exp(phi) @ so3.from_quaternion(quaternion), source)
-        slope = ca.substitute(ca.vertcat(power, ca.gradient(power, phi)), phi, ca.SX.zeros(3, 1))
-        return ca.Function("patch", [quaternion, source], [slope[0], slope[1:]], {"cse": True})
+        return _function(self)
+
+
+@lru_cache(maxsize=16)
+def _function(patch: Patch) -> ca.Function:
+    """Power and gradient of a patch, made once: as long as a thousand evaluations."""
+    quaternion, source, phi = ca.SX.sym("quaternion", 4), ca.SX.sym("source", 3), ca.SX.sym("phi", 3)
+    power = patch.power(so3.exp(phi) @ so3.from_quaternion(quaternion), source)
+    slope = ca.substitute(ca.vertcat(power, ca.gradient(power, phi)), phi, ca.SX.zeros(3, 1))
+    return ca.Function("patch", [quaternion, source], [slope[0], slope[1:]], {"cse": True})

@@ -17,6 +17,8 @@ from covocp.solving.comparison import terminal_miss
 
 FORMS = ("eliminated", "states")
 QUIET: dict[str, Any] = {"tolerance": 1e-10, "progress": False}
+# How the control moves is said: other numbers of switches, of which each is a run, are tried elsewhere.
+MOVING: dict[str, Any] = {"guess": {"u": 0.5}}
 GRADIENT: dict[str, Any] = {"method": "gradient", "progress": False, "tolerance": 1e-7, "violation_tolerance": 1e-9}
 
 
@@ -171,7 +173,8 @@ def variance_at(solution: co.Solution, time: float) -> float:
 
 def test_a_variance_is_below_its_limit_at_the_instant() -> None:
     """By scipy too; both formulations and both methods agree, and the multiplier is the difference of costs."""
-    plain, states = (co.solve(learning(0.05), intervals=40, covariances=form, **QUIET) for form in FORMS)
+    plain = co.solve(learning(0.05), intervals=40, **QUIET)
+    states = co.solve(learning(0.05), intervals=40, covariances="states", **MOVING, **QUIET)
     assert variance_at(plain, 2.0) == pytest.approx(0.05, rel=3e-5)
     assert float(plain.at(2.0)["E"][2, 2]) == pytest.approx(0.05, abs=1e-7)
     assert states.cost == pytest.approx(plain.cost, rel=1e-10)
@@ -198,7 +201,8 @@ def test_a_variance_is_below_its_limit_at_the_instant() -> None:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("side", [None, "before"])
 def test_a_reading_at_the_instant_counts_after_it(side: Any, form: str) -> None:
-    found = co.solve(learning(0.05, sampled=True, side=side), intervals=30, covariances=form, **QUIET)
+    moving = MOVING if form == "states" else {}
+    found = co.solve(learning(0.05, sampled=True, side=side), intervals=30, covariances=form, **moving, **QUIET)
     early, late = found.at(2.0, "before")["E"], found.at(2.0)["E"]
     assert float((early if side == "before" else late)[2, 2]) == pytest.approx(0.05, abs=1e-7)
     gain = early[:, 0] / (early[0, 0] + 0.02)
@@ -232,8 +236,9 @@ def test_every_step_passes_an_instant(options: dict[str, Any]) -> None:
 
 def test_rows_that_nothing_needs_are_left_out_with_a_condition_too() -> None:
     """A lag that is known exactly: as with a variance of next to nothing; with less a run takes hundreds of steps."""
-    found = [co.solve(learning(0.1, actuator=0.0), intervals=40, covariances=form, **QUIET) for form in FORMS]
-    kept = co.solve(learning(0.1, actuator=1e-10), intervals=40, **QUIET)
+    options = {"intervals": 40, **MOVING, **QUIET}
+    found = [co.solve(learning(0.1, actuator=0.0), covariances=form, **options) for form in FORMS]
+    kept = co.solve(learning(0.1, actuator=1e-10), **options)
     for solution in found:
         assert solution.cost == pytest.approx(kept.cost, rel=1e-8)
         assert solution.multiplier("learnt") == pytest.approx(kept.multiplier("learnt"), rel=1e-6)

@@ -347,7 +347,7 @@ def uncertain_lag(measured, **weight):
 def test_costs_of_nothing_but_roundoff_are_no_spurious_stationary_point():
     """Nothing has to be reached, so nothing is done: both costs are zero, and one is "above" the other by 1e-17."""
     for method in co.methods():
-        solution = solve(uncertain_lag(1), method=method)  # a warning would be an error
+        solution = solve(uncertain_lag(1), method=method, intervals=30)  # a warning would be an error
         assert abs(solution.cost) < 1e-12
         assert abs(solution.stats["classical_cost"]) < 1e-12
         assert "gained" not in str(solution)

@@ -23,7 +23,7 @@ def integrated(solution: co.Solution, prior: float, noise: float = NOISE) -> flo
 @pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
 @pytest.mark.parametrize("prior", [1.0, 1e3, 1e6])
 def test_a_larger_prior_in_a_loop_has_its_own_cost(method, prior):
-    solver = co.Solver(moved(), method, intervals=20)
+    solver = co.Solver(moved(), method, intervals=12)
     solver.solve(progress=False)
     found = solver.solve(covariance=prior * np.eye(2), assess=False, progress=False)
     assert found.cost == pytest.approx(integrated(found, prior), rel=1e-3)

@@ -50,6 +50,7 @@ def otherwise_excited(
     ready: Callable[..., Prepared],
     guess: Given,
     reporter: Progress,
+    slow: bool = False,
 ) -> tuple[Outcome, Guess]:
     """The cheaper minimum of another number of switches, where a problem of unknowns and bounded controls has one.
 
@@ -63,6 +64,7 @@ def otherwise_excited(
         ready: makes the problem ready on the mesh of other `options`, by Ipopt.
         guess: what was given as such.
         reporter: of iterations.
+        slow: whether the method that ran takes much longer than Ipopt, which then compares on a fine mesh too.
 
     Returns:
         The outcome of the cheaper minimum with the iterations of both runs, and its start; else what was given.
@@ -74,8 +76,9 @@ def otherwise_excited(
         return found
     values = outcome.extremal.parameters
     fewer = thinned(statement, options, prepared.mesh, values, COARSE)
+    own = fewer is None and not slow
     try:
-        coarse = prepared if fewer is None else ready(options=fewer)
+        coarse = prepared if own else ready(options=fewer or options)
     except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the found one counts
         return found
     for controls in _cheaper(statement, coarse, values, outcome, reporter):

@@ -326,7 +326,7 @@ class Solver(OtherStarts):
             taken = self._own if self._by_ipopt else {}
             coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **taken)
             run = (self._prepared, self._solved, self._options, coarse)
-            outcome, start = otherwise_excited((outcome, start), *run, guess, reporter)
+            outcome, start = otherwise_excited((outcome, start), *run, guess, reporter, self._by == "gradient")
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(
