@@ -204,7 +204,8 @@ def _spread(statement: Statement, guess: Trajectory, x: Array) -> Array:
         if block.size == variances.size:
             rows, columns = half_indices(block.size)
             variances += np.abs(guess.e[:, block.span][:, rows == columns]).mean(axis=0)
-    return np.where(variances > NOTHING, np.sqrt(variances), sizes)
+    told = np.isfinite(variances) & (variances > NOTHING)
+    return np.where(told, np.sqrt(np.where(told, variances, 1.0)), sizes)
 
 
 def with_given(statement: Statement, scales: Scales) -> Scales:
