@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -336,13 +337,14 @@ def test_a_sine_at_whose_zeros_the_steps_meet_it_is_no_magnitude(frequency, meth
 
 def lag_of_periods(frequency: float) -> co.Problem:
     """A lag that is kept at rest while it is shaken: steps that meet each period at its zeros find nothing to do."""
-    ocp = co.Problem(2.0)
+    ocp = co.Problem(DURATION)
     x, u = ocp.state("x", initial=0.0), ocp.control("u")
     ocp.dynamics(x, u - 0.5 * x + ca.sin(2 * np.pi * frequency * ocp.time))
     ocp.minimize(running=0.1 * u**2 + x**2)
     return ocp
 
 
+@cache
 def least_cost(frequency: float) -> float:
     """By the two-point boundary value problem of x, its costate, and the cost."""
 
@@ -351,8 +353,8 @@ def least_cost(frequency: float) -> float:
         shake = np.sin(2 * np.pi * frequency * t)
         return np.vstack([-0.5 * x - 5.0 * p + shake, 0.5 * p - 2.0 * x, 2.5 * p**2 + x**2])
 
-    t = np.linspace(0.0, 2.0, round(80 * frequency) + 1)
-    found = solve_bvp(rates, lambda a, b: np.array([a[0], b[1], a[2]]), t, np.zeros((3, t.size)), tol=1e-4)
+    t = np.linspace(0.0, DURATION, round(40 * frequency * DURATION) + 1)
+    found = solve_bvp(rates, lambda a, b: np.array([a[0], b[1], a[2]]), t, np.zeros((3, t.size)), tol=1e-4, max_nodes=t.size)
     assert found.success
     return float(found.y[2, -1])
 
