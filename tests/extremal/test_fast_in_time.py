@@ -353,8 +353,11 @@ def least_cost(frequency: float) -> float:
         shake = np.sin(2 * np.pi * frequency * t)
         return np.vstack([-0.5 * x - 5.0 * p + shake, 0.5 * p - 2.0 * x, 2.5 * p**2 + x**2])
 
+    def ends(first, last):
+        return np.array([first[0], last[1], first[2]])
+
     t = np.linspace(0.0, DURATION, round(40 * frequency * DURATION) + 1)
-    found = solve_bvp(rates, lambda a, b: np.array([a[0], b[1], a[2]]), t, np.zeros((3, t.size)), tol=1e-4, max_nodes=t.size)
+    found = solve_bvp(rates, ends, t, np.zeros((3, t.size)), tol=1e-4, max_nodes=t.size)
     assert found.success
     return float(found.y[2, -1])
 
