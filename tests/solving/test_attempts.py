@@ -61,14 +61,6 @@ def test_a_poor_rival_does_not_stop_the_starts_after_one_that_lost_its_way():
     assert cost_from(method, start(5.0, rival=True, about=4.0), start(1.0), start(2.0), start(9.0)) == 5.0
 
 
-def test_where_all_starts_lead_astray_the_run_that_came_closest_is_made_again():
-    astray = {"converged": False, "wandered": True}
-    known = {1.0: {"cost": 3.0, **astray}, 2.0: {"cost": 1.0, **astray}, 3.0: {"cost": 2.0, **astray}}
-    method = Method(known)
-    from_starts(method, np.zeros(0), iter([start(1.0), start(2.0), start(3.0)]), method)
-    assert method.runs == [1.0, 2.0, 3.0, 2.0]
-
-
 def test_a_rival_that_costs_what_it_was_thought_to_stops_them():
     method = Method({5.0: {"cost": 4.01}, 1.0: {"cost": 0.0, "converged": False, "wandered": True}})
     assert cost_from(method, start(5.0, rival=True, about=4.0), start(1.0), start(2.0)) == 4.01

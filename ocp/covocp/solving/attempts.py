@@ -50,9 +50,9 @@ def from_starts(
     """Solve from the first start from which the method finds its way, and from its rivals: the cheapest counts.
 
     A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
-    all of them, the run that came closest counts: it is made again, and not stopped, where it was stopped. Where a run
-    fails from a start that a feedback holds, there is another one that is left to itself. Rivals, which come first
-    among the guesses, are tried after the first start, but for those to whose way that has led already.
+    all of them, the first run counts: it is made again, and not stopped, where it was stopped. Where a run fails from a
+    start that a feedback holds, there is another one that is left to itself. Rivals, which come first among the
+    guesses, are tried after the first start, but for those to whose way that has led already.
 
     Returns:
         The outcome, and the start from which it came.
@@ -239,7 +239,7 @@ class _Runs:
         if not outcome.converged and tried[0][1].held and not tried[0][0].stats.get("wandered"):
             outcome, guess = tried[0]
         elif not outcome.converged and outcome.stats.get("wandered") and not self.reporter.stop:
-            guess = min(tried, key=lambda one: rank(one[0]))[1]
+            guess = tried[0][1]
             outcome = self.prepared.solve(self.values, guess, self.reporter)
         if len(self.tried) > 1:
             outcome = replace(outcome, stats={**outcome.stats, "tried": len(self.tried)})

@@ -40,7 +40,7 @@ WIDE_BOUNDS = 1e3
 # What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
 NOTHING = 1e-50
 # By how much more than it does a gain may let the control scatter in its units: a start knows less than it will do.
-SCATTER = 2.0
+SCATTER = 1.4
 # A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
 ROUNDOFF = 1e-24
 
@@ -171,8 +171,8 @@ def choose_scales(
 def _with_gain(statement: Statement, guess: Trajectory, scales: Scales) -> Scales:
     """The same with a gain that is chosen freely in units of controls and states: it moves nothing of the nominal.
 
-    Each entry by itself lets the control scatter as much as the largest one does; where all are zero, as much as the
-    nominal control is.
+    Each entry by itself lets the control scatter a little more than the largest one does; where all are zero, than the
+    nominal control moves.
     """
     blocks = [b for b in (*statement.controls, *statement.states) if b.name == GAIN]
     if statement.loop is None or not blocks or GAIN in statement.scales:
