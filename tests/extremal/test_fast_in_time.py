@@ -373,6 +373,12 @@ def test_where_the_steps_see_nothing_of_what_costs_they_are_shortened(options):
     assert error < 4.0 * (solution.mesh_error + solution.optimality.control_error)
 
 
+def test_what_the_user_limits_is_not_tried_on_other_steps():
+    with pytest.raises(co.SolveError) as failed:
+        co.solve(lag_of_periods(10.0), intervals=20, max_iterations=50, progress=False)
+    assert failed.value.solution.mesh.substeps == 1
+
+
 def test_a_state_that_long_steps_move_where_nothing_costs_is_no_error_of_the_cost():
     """A lag that is asked for at a moment alone: it dies out in one long interval, of which halves tell the state."""
     ocp = co.Problem(10.0)
@@ -381,7 +387,9 @@ def test_a_state_that_long_steps_move_where_nothing_costs_is_no_error_of_the_cos
     ocp.dynamics(x, u - 0.5 * x)
     ocp.minimize(running=0.1 * u**2 + weight * (x - 1) ** 2)
     grid = np.concatenate([np.linspace(0.0, 0.497, 40), np.linspace(0.497, 0.503, 13)[1:], [0.6, 1.0]])
-    with pytest.warns(co.CovocpWarning, match="moves a state by .* between two nodes, and the cost by") as told:
+    with pytest.warns(
+        co.CovocpWarning, match="changes the cost by .* and moves a state by .* between two nodes"
+    ) as told:
         solution = co.solve(ocp, grid=grid, substeps=1, progress=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -92,15 +92,16 @@ def _coarse(solution: Solution, error: float) -> str:
     statement, remedy = solution.statement, "Use more intervals or substeps."
     if solution.method != METHOD and "refine" not in solution.stats:
         remedy = "Let refine=1e-4 put nodes where they are needed, or use more intervals or substeps."
-    changes, node = f"changes the cost by {error:.1e} (relative)", ""
-    if statement is not None and not statement.autonomous:
-        node = _node(solution)
-        paid = mesh_error(solution.extremal, solution.cost_terms["running"], solution.within, of_states=False)
-        if paid <= COARSE_MESH:
-            moves = (
-                f"moves a state by {error:.1e} of its range between two nodes, and the cost by {paid:.1e} (relative)"
-            )
-            return f"The integration steps are long: halving them {moves}. {node}Use more substeps (substeps=)."
+    if statement is None or statement.autonomous:
+        changes = f"changes the cost by {error:.1e} (relative)"
+        return f"The mesh is too coarse: halving the integration steps {changes}. {remedy}"
+    node = _node(solution)
+    paid = mesh_error(solution.extremal, solution.cost_terms["running"], solution.within, of_states=False)
+    changes = f"changes the cost by {paid:.1e} (relative)"
+    if error > paid:
+        changes += f" and moves a state by {error:.1e} of its range between two nodes"
+    if paid <= COARSE_MESH:
+        return f"The integration steps are long: halving them {changes}. {node}Use more substeps (substeps=)."
     return f"The mesh is too coarse: halving the integration steps {changes}. {node}{remedy}"
 
 

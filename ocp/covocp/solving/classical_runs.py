@@ -42,6 +42,7 @@ class ClassicalRuns:
     _prepared: Prepared
     _classical: ClassicalDesign
     _own_steps: bool
+    _counted: bool
     _patient: dict[str, Any]
     _at_once: bool
     _asked_for: bool
@@ -145,13 +146,13 @@ class ClassicalRuns:
 
     def _finer_for(self, outcome: Outcome) -> Options | None:
         """Options with the shorter steps that an outcome needs, a failed one where the model is faster than these."""
+        made = partial(finer_steps, outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
+        if outcome.converged:
+            return made()
         try:
-            if outcome.converged or changes_within_steps(outcome.extremal):
-                return finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
-        except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):
-            if outcome.converged:
-                raise
-        return None  # or there are no values where it ended
+            return made() if not self._counted and changes_within_steps(outcome.extremal) else None
+        except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):  # there are no values where it ended
+            return None
 
     def _at_once_by(self, finer: Options, outcome: Outcome, values: Array, reporter: Progress) -> Outcome | None:
         """What was found from the deterministic cost at once, by shorter steps; None where a run must tell."""

@@ -80,7 +80,6 @@ class OtherStarts(ClassicalRuns):
     _first: tuple[Options, Prepared]
     _remade: bool
     _looked: bool
-    _counted: bool
     _otherwise: bool
 
     def _from_guess(

@@ -39,7 +39,7 @@ GIVEN_SHARE = 1e-6
 WIDE_BOUNDS = 1e3
 # What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
 NOTHING = 1e-50
-# By how much more than it does a gain may let the control scatter in its units: a start knows less than it will do.
+# An entry of a gain, of one in its unit, lets the control scatter by so many times what the largest does along a guess.
 SCATTER = 1.4
 # A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
 ROUNDOFF = 1e-24
