@@ -10,7 +10,8 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Given
+from covocp.base.expressions import Given, sequence_of
+from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import functions, needed
 from covocp.passage.operations import Program, program
@@ -49,21 +50,88 @@ def in_columns(owner: Owner, function: ca.Function, count: int) -> ca.Function:
     return kept.nodes.setdefault((function, count), kept.columns(function, count))
 
 
+def in_turn(owner: Owner, function: ca.Function, steps: int, sequences: int) -> ca.Function:
+    """A function of a value and others in sequences from several first values, in compiled code.
+
+    Args:
+        owner: as of `in_columns`.
+        function: (value, *others) -> value after it, and more; all dense.
+        steps: in each sequence.
+        sequences: from a first value each.
+
+    Returns:
+        (first values, columns of the others, sequence after sequence) -> columns of what the function gives, as
+        `sequence_of` mapped over the sequences.
+    """
+    kept = _KEPT.setdefault(owner, _Kept())
+    key = (function, steps * sequences, steps)
+    found = kept.nodes.get(key)
+    return kept.nodes.setdefault(key, kept.sequences(function, steps, sequences)) if found is None else found
+
+
+def numbers_in_turn(
+    owner: Owner, function: ca.Function, first: Array, columns: Sequence[Array], steps: int
+) -> list[Array] | None:
+    """What `in_turn` gives of numbers, without a node.
+
+    Args:
+        owner: as of `in_columns`.
+        function: as of `in_turn`.
+        first: first values, a column for each sequence.
+        columns: of the others, sequence after sequence.
+        steps: in each sequence.
+
+    Returns:
+        Columns of what the function gives; None where compiled code cannot take it.
+
+    Raises:
+        MemoryError: there was none.
+    """
+    kept = _KEPT.setdefault(owner, _Kept())
+    told = kept.told(function)
+    if told is None or not told.plain or not all(shape.is_dense() or not shape.nnz() for shape in told.outputs):
+        return None
+    given = [np.asfortranarray(values, dtype=float) for values in (first, *columns)]
+    width = first.shape[1] * steps
+    found = [np.zeros((shape.shape[0], shape.shape[1] * width), order="F") for shape in told.outputs]
+    if told.run([array.ctypes.data for array in (*given, *found)], first.shape[1], steps):
+        raise MemoryError
+    return found
+
+
 class _Kept:
-    """What is kept of one owner: nodes, and operations of functions."""
+    """What is kept of one owner: nodes, and functions as the library is told of them."""
 
     def __init__(self) -> None:
-        self.nodes: dict[tuple[ca.Function, int], ca.Function] = {}
-        self._programs: dict[ca.Function, Program | None] = {}
+        self.nodes: dict[tuple[ca.Function, int] | tuple[ca.Function, int, int], ca.Function] = {}
+        self._told: dict[ca.Function, OnColumns | None] = {}
+
+    def told(self, function: ca.Function) -> OnColumns | None:
+        """A function as the library is told of it; None without the library, or where operations are not known."""
+        if functions() is None:
+            return None
+        if function not in self._told:
+            listed = program(function)
+            self._told[function] = None if listed is None else OnColumns(function, listed)
+        return self._told[function]
 
     def columns(self, function: ca.Function, count: int, name: str = "", options: Given = None) -> ca.Function:
         """A node where it pays, else CasADi's map."""
-        if count < FEWEST or functions() is None:
-            return function.map(count)
-        if function not in self._programs:
-            self._programs[function] = program(function)
-        listed = self._programs[function]
-        return function.map(count) if listed is None else _Columns(self, function, count, listed, name, options)
+        told = self.told(function) if count >= FEWEST else None
+        return function.map(count) if told is None else _Columns(self, function, (count, 1), told, name, options)
+
+    def sequences(self, function: ca.Function, steps: int, sequences: int) -> ca.Function:
+        """A node of sequences where these can be had, else CasADi's."""
+        told = self.told(function)
+        if told is None or not told.plain:
+            return _of_casadi(function, steps, sequences)
+        return _Columns(self, function, (sequences, steps), told)
+
+
+def _of_casadi(function: ca.Function, steps: int, sequences: int) -> ca.Function:
+    """Sequences of a function, or columns of it where each has one step, by CasADi's own."""
+    run = sequence_of(function, steps)
+    return run.map(sequences) if sequences > 1 else run
 
 
 def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
@@ -80,55 +148,73 @@ class OnColumns:
     def __init__(self, function: ca.Function, listed: Program) -> None:
         """Keep what the library points to."""
         self._run = needed()["columns"]
-        shapes = [function.sparsity_in(i) for i in range(function.n_in())]
-        results = [function.sparsity_out(i) for i in range(function.n_out())]
-        self._listed, self._heights = listed, np.array([shape.nnz() for shape in (*shapes, *results)], np.intc)
+        self.inputs = [function.sparsity_in(i) for i in range(function.n_in())]
+        self.outputs = [function.sparsity_out(i) for i in range(function.n_out())]
+        self._listed, heights = listed, [shape.nnz() for shape in (*self.inputs, *self.outputs)]
+        self._heights = np.array(heights, np.intc)
         rows, constants = listed
         self._told = (
             *(len(rows), rows.ctypes.data, constants.ctypes.data, max(function.sz_w(), 1)),
-            *(len(shapes), self._heights.ctypes.data),
+            *(len(self.inputs), self._heights.ctypes.data),
         )
-        self._places = ctypes.c_void_p * len(self._heights)
+        self._places = ctypes.c_void_p * len(heights)
 
-    def run(self, addresses: Sequence[int | None], count: int) -> int:
-        """Evaluate it on so many columns.
+    @property
+    def plain(self) -> bool:
+        """Whether arguments and the first result are dense, and the first ones alike: what sequences are made of."""
+        shapes = (*self.inputs, self.outputs[0])
+        return all(shape.is_dense() for shape in shapes) and self.inputs[0].shape == self.outputs[0].shape
+
+    def run(self, addresses: Sequence[int | None], count: int, steps: int = 1) -> int:
+        """Evaluate it on so many columns, or sequences of them.
 
         Args:
             addresses: where the nonzeros of each argument, then of each result lie; None: zeros, or not wanted.
-            count: columns.
+            count: columns, or sequences.
+            steps: of each sequence.
 
         Returns:
             0; else there was no memory.
         """
-        return int(self._run(*self._told, self._places(*addresses), count))
+        return int(self._run(*self._told, self._places(*addresses), steps, count))
 
 
 class _Columns(Node):
-    """A function of scalars on columns."""
+    """A function of scalars on columns, or on sequences of them."""
 
     def __init__(
-        self, kept: _Kept, function: ca.Function, count: int, listed: Program, name: str, options: Given
+        self,
+        kept: _Kept,
+        function: ca.Function,
+        size: tuple[int, int],
+        told: OnColumns,
+        name: str = "",
+        options: Given = None,
     ) -> None:
-        """Keep what the library is told."""
+        """Keep what the library is told; size: sequences, and steps of each."""
         self._kept = kept
-        self._function, self._count, self._told = function, count, OnColumns(function, listed)
+        self._function, self._told = function, told
+        self._count, self._steps = size
         self._derived: dict[tuple[str, int], ca.Function] = {}
-        shapes = [function.sparsity_in(i) for i in range(function.n_in())]
-        results = [function.sparsity_out(i) for i in range(function.n_out())]
-        inputs, outputs = ([beside(shape, count) for shape in each] for each in (shapes, results))
-        own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(shapes))], **(options or {})}
-        super().__init__(name or f"columns_{function.name()}", inputs, outputs, own)
+        widths = [self._count, *[self._count * self._steps] * (len(told.inputs) - 1 + len(told.outputs))]
+        shapes = [beside(own, width) for own, width in zip((*told.inputs, *told.outputs), widths, strict=True)]
+        inputs, outputs = shapes[: len(told.inputs)], shapes[len(told.inputs) :]
+        own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(inputs))], **(options or {})}
+        kind = "columns" if self._steps == 1 else "sequences"
+        super().__init__(name or f"{kind}_{function.name()}", inputs, outputs, own)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        return self._told.run(needed()["addresses"]((*arguments, *results)), self._count)
+        return self._told.run(needed()["addresses"]((*arguments, *results)), self._count, self._steps)
 
     def has_jac_sparsity(self, oind: int, iind: int) -> bool:
         """Of CasADi."""
         return True
 
     def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
-        """Of CasADi: columns have nothing to do with one another."""
+        """Of CasADi: columns have nothing to do with one another, and sequences are CasADi's own."""
+        if self._steps > 1:
+            return _of_casadi(self._function, self._steps, self._count).jac_sparsity(oind, iind)
         return ca.diagcat(*[self._function.jac_sparsity(oind, iind)] * self._count)
 
     def has_reverse(self, nadj: int) -> bool:
@@ -152,11 +238,13 @@ class _Columns(Node):
         return self._derivative("forward", nfwd, name, opts)
 
     def _derivative(self, kind: str, directions: int, name: str, options: Given) -> ca.Function:
-        """Of one direction the same of columns, of several what CasADi's map gives."""
+        """Of one direction the same of columns; of several, and of sequences, what CasADi's own gives."""
         found = self._derived.get((kind, directions))
         if found is not None:
             return found
-        if directions > 1:
+        if self._steps > 1:
+            made = getattr(_of_casadi(self._function, self._steps, self._count), kind)(directions)
+        elif directions > 1:
             made = getattr(self._function.map(self._count), kind)(directions)
         else:
             made = self._kept.columns(getattr(self._function, kind)(1), self._count, name, options)

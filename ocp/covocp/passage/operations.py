@@ -35,7 +35,7 @@ Program = tuple[NDArray[np.intc], Array]
 _TABLE = np.full(256, UNKNOWN, np.intc)
 _TABLE[list(NUMBERS)] = list(NUMBERS.values())
 # Operations that are compared with what CasADi tells of each, of those read at once; from so many on it pays.
-COMPARED, MANY = 24, 200
+COMPARED, MANY = 8, 120
 
 
 def program(function: ca.Function) -> Program | None:
@@ -81,23 +81,26 @@ def read_at_once(function: ca.Function) -> Program | None:
     That is no promise of CasADi's: what is found is compared with what it tells of some of them (`_agrees`).
     """
     count = function.n_instructions()
+    first = asked_one_by_one(function, range(min(count, COMPARED)))
+    given = () if first is None else np.flatnonzero(first[0][:, 0] == INPUT).tolist()
+    if first is None or not given:
+        return None
     digits = np.frombuffer(function.serialize().encode(), np.uint8) - ord("a")
     if digits.size % 2 or digits.max(initial=0) > 15:
         return None
     content = (digits[0::2] | digits[1::2] << 4).tobytes()
-    places = distinct(np.linspace(0, count - 1, COMPARED).astype(int))
-    kinds = np.array([function.instruction_id(int(k)) for k in places])
-    for offset in range(4):
-        numbers = np.frombuffer(content, "<i4", (len(content) - offset) // 4, offset)
-        starts = np.arange(max(numbers.size - 4 * count + 1, 0))
-        for place, kind in zip(places, kinds, strict=True):
-            starts = starts[numbers[starts + 4 * place] == kind]
-            if not starts.size:
-                break
-        for start in starts.tolist():
-            listed = _listed(numbers[start : start + 4 * count].reshape(count, 4))
-            if listed is not None and _agrees(listed, function, places.tolist()):
+    place = given[0]
+    _, argument, inside, register = first[0][place].tolist()
+    record = np.array([int(ca.OP_INPUT), register, argument, inside], "<i4").tobytes()
+    places = distinct(np.linspace(0, count - 1, COMPARED).astype(int)).tolist()
+    found = content.find(record)
+    while found >= 0:
+        start = found - 16 * place
+        if start >= 0 and len(content) >= start + 16 * count:
+            listed = _listed(np.frombuffer(content, "<i4", 4 * count, start).reshape(count, 4))
+            if listed is not None and _agrees(listed, function, places):
                 return listed
+        found = content.find(record, found + 1)
     return None
 
 

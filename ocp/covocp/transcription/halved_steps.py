@@ -21,7 +21,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import NUMERIC_RUN
 from covocp.transcription.shooting import compiled_steps, interval_columns, shoot
-from covocp.transcription.steering import nominal_states
+from covocp.transcription.steering import compiled_along, nominal_states
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
 
@@ -132,6 +132,9 @@ class _Runs:
     def states(self, x: Array, u: Array, duration: float, parameters: Array) -> Array:
         """The states at the ends of all intervals, run from a state, which is the first of them."""
         st, mesh, count = self._statement, self._mesh, self._mesh.intervals
+        along = compiled_along(st, mesh, x, u, duration, parameters)
+        if along is not None:
+            return np.vstack([x, along[0].T])
         if self._often("states"):
             return nominal_states(st, mesh, x, u, duration, parameters)
         common = interval_columns(mesh, ca.DM(u.T), ca.DM(duration), ca.DM(parameters))

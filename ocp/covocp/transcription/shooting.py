@@ -15,6 +15,8 @@ import numpy as np
 
 from covocp.base.expressions import Expr, beside, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import Array
+from covocp.passage.columns import in_turn, numbers_in_turn
 from covocp.passage.library import functions
 from covocp.passage.sweep import passed_by, values_by
 from covocp.statement.interval import Interval
@@ -54,6 +56,15 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
 
 
+def numbered_columns(mesh: Mesh, u: Array, duration: float, parameters: Array) -> list[Array]:
+    """The same of numbers, controls a row each."""
+    n = mesh.intervals
+    start, end = control_ends(mesh, u.T)
+    reading = mesh.readings if mesh.readings.size else np.zeros((0, n))
+    rest = np.full((1, n), duration), np.tile(parameters[:, None], (1, n)), reading
+    return [start, end, mesh.nodes[None, :-1], np.diff(mesh.nodes)[None], *rest]
+
+
 @lru_cache(maxsize=MESHES)
 def _of_mesh(mesh: Mesh) -> tuple[ca.DM, ca.DM, ca.DM]:
     """Starts and lengths of the intervals of a mesh, and what they read, a column each."""
@@ -86,7 +97,7 @@ def shoot(
     together = statement.matrices and (not mesh.eliminated or statement.coupled)
     start = ca.vertcat(variables.x, variables.e) if together else variables.x
     advance = advancing(statement, mesh)
-    ends, fine, cost = _segments(mesh, advance, start, intervals) if run is None else run
+    ends, fine, cost = _segments(statement, mesh, advance, start, intervals) if run is None else run
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
     gaps = ends[:, last] - start[:, 1:]
@@ -115,9 +126,12 @@ def advancing(statement: Statement, mesh: Mesh) -> ca.Function:
     return full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
 
 
-def nominal_run(statement: Statement, mesh: Mesh, variables: Expr, intervals: Interval) -> tuple[Any, Any, Any]:
-    """What `run` of `shoot` is where the nominal runs alone."""
-    return _segments(mesh, nominal_interval(statement, mesh.substeps, mesh.step), variables.x, intervals)
+def nominal_run(
+    statement: Statement, mesh: Mesh, variables: Expr, intervals: Interval, *, compiled: bool = False
+) -> tuple[Any, Any, Any]:
+    """What `run` of `shoot` is where the nominal runs alone; `compiled`: in the library, where CasADi sees no steps."""
+    advance = nominal_interval(statement, mesh.substeps, mesh.step)
+    return _segments(statement, mesh, advance, variables.x, intervals, compiled=compiled)
 
 
 def _inside(mesh: Mesh) -> list[int]:
@@ -126,7 +140,15 @@ def _inside(mesh: Mesh) -> list[int]:
     return [k * m + j * stride - 1 for k in range(n) for j in range(1, mesh.points)]
 
 
-def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval) -> tuple[Any, Any, Any]:
+def _segments(
+    statement: Statement,
+    mesh: Mesh,
+    advance: ca.Function,
+    start: Expr,
+    intervals: Interval,
+    *,
+    compiled: bool = False,
+) -> tuple[Any, Any, Any]:
     """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
     ends: list[Any] = []
     fine: list[Any] = []
@@ -135,15 +157,29 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval
     alike = len(set(mesh.segments)) == 1
     for length in sorted(set(mesh.segments), reverse=True):
         count = mesh.segments.count(length)
-        function = sequence_of(advance, length)
-        function = function.map(count) if count > 1 else function
         span = slice(first_interval, first_interval + count * length)
-        own = intervals if alike else intervals.columns(span)
-        outputs = function.call([start[:, first_segment : first_segment + count], *own])
+        given = [start[:, first_segment : first_segment + count], *(intervals if alike else intervals.columns(span))]
+        outputs = _in_sequence(statement, advance, given, (length, count), compiled=compiled)
         for collected, value in zip((ends, fine, costs), outputs, strict=True):
             collected.append(value)
         first_segment, first_interval = first_segment + count, span.stop
     return beside(ends), beside(fine), beside(costs)
+
+
+def _in_sequence(
+    statement: Statement, advance: ca.Function, given: list[Any], size: tuple[int, int], *, compiled: bool
+) -> list[Any]:
+    """So many segments of so many intervals each, in the library where they are numbers or that is asked for."""
+    length, count = size
+    if all(isinstance(value, ca.DM) for value in given):
+        numbers = [value.full() for value in given]
+        found = numbers_in_turn(statement, advance, numbers[0], numbers[1:], length)
+        if found is not None:
+            return [ca.DM(values) for values in found]
+    if compiled:
+        return in_turn(statement, advance, length, count).call(given)
+    function = sequence_of(advance, length)
+    return (function.map(count) if count > 1 else function).call(given)
 
 
 def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
@@ -245,7 +281,7 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
     """Half-vectors at the start of the matrices that run backward, where they are no variables; as `shoot` has them."""
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     advance = nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, _ = _segments(mesh, advance, variables.x, intervals)
+    ends, fine, _ = _segments(statement, mesh, advance, variables.x, intervals)
     columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
     assert statement.matrix_end is not None
     last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)

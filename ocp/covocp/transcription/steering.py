@@ -14,10 +14,11 @@ from covocp.base.expressions import sequence_of
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
+from covocp.passage.columns import numbers_in_turn
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh, control_places
-from covocp.transcription.shooting import interval_columns
+from covocp.transcription.shooting import interval_columns, numbered_columns
 from covocp.transcription.steps import nominal_interval
 
 STEERING_STEPS = 4
@@ -75,8 +76,7 @@ class Run:
 
     def running(self, u: Array) -> float:
         """Integral of the running cost; zero where that depends on the matrices."""
-        outputs = _numbers_along(self.statement, self.mesh).evaluated(self.start, u.T, self.duration, self.parameters)
-        return float(outputs[1].item())
+        return _numbers_along(self.statement, self.mesh, self.start, u, self.duration, self.parameters)[1]
 
     @property
     def weights(self) -> Array:
@@ -109,17 +109,36 @@ def _along(statement: Statement, mesh: Mesh) -> ca.Function:
 
 
 @lru_cache(maxsize=KEPT)
-def _numbers_along(statement: Statement, mesh: Mesh) -> Matrices:
+def _along_of_casadi(statement: Statement, mesh: Mesh) -> Matrices:
     """The same, for numbers."""
     return Matrices(_along(statement, mesh))
+
+
+def compiled_along(
+    statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
+) -> tuple[Array, float] | None:
+    """The same by the compiled library, controls a row each; None where that cannot take the model."""
+    advance = nominal_interval(statement, mesh.substeps, mesh.step)
+    columns = numbered_columns(mesh, u, duration, parameters)
+    found = numbers_in_turn(statement, advance, start[:, None], columns, mesh.intervals)
+    return None if found is None else (found[0], float(np.cumsum(found[2])[-1]))
+
+
+def _numbers_along(
+    statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
+) -> tuple[Array, float]:
+    found = compiled_along(statement, mesh, start, u, duration, parameters)
+    if found is not None:
+        return found
+    ends, cost = _along_of_casadi(statement, mesh).evaluated(start, u.T, duration, parameters)
+    return ends, float(cost.item())
 
 
 def nominal_states(
     statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
 ) -> Array:
     """States at the nodes (N + 1, nx) of a run of the nominal; NaN or inf where it diverges."""
-    ends = _numbers_along(statement, mesh).evaluated(start, u.T, duration, parameters)[0]
-    return np.vstack([start, ends.T])
+    return np.vstack([start, _numbers_along(statement, mesh, start, u, duration, parameters)[0].T])
 
 
 @lru_cache(maxsize=KEPT)

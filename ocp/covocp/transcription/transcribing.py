@@ -336,7 +336,7 @@ class _AlongRun:
 
     def __init__(self, variables: _Variables) -> None:
         self._variables = variables
-        self._run = nominal_run(variables.statement, variables.mesh, variables, variables.intervals)
+        self._run = nominal_run(variables.statement, variables.mesh, variables, variables.intervals, compiled=True)
         names = ("ends", "fine", "cost")
         self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
         ends, fine, costs = self._given
