@@ -1,12 +1,15 @@
 """The scripts that run while the documentation is built: tutorial, how-to pages and the gallery of the examples.
 
-They are copied to `_build/scripts` first, so that what they write stays there; from there sphinx-gallery runs them.
-Pictures are the PNG files that a script writes. One that fails, or prints nothing, ends the build.
+They are copied to `_build/scripts` first, so that what they write stays there; from there sphinx-gallery runs them, two
+at a time. Pictures are the PNG files that a script writes. One that fails, or prints nothing, ends the build.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
+from fnmatch import fnmatch
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +108,7 @@ HOWTO = (
 )
 ORDER = [name for *_, names in GALLERY for name in names]
 HEADER = "GALLERY_HEADER.rst"
+EXPORTS = "export_c("
 PRINTED = "rst-class:: sphx-glr-script-out"
 FULL_WIDTH = 9.0  # of a picture that fills the width of a page [inch]
 NO_PICTURE = COPIES / "no_picture.png"
@@ -122,10 +126,17 @@ class ListedOrder:
         return self.names.index(Path(file).stem) if Path(file).stem in self.names else -1
 
 
+def named_pictures(script: Path) -> list[str]:
+    """Patterns of the PNG files that a script names: others run beside it in the same folder."""
+    return [re.sub(r"\{\w+\}", "*", name) for name in re.findall(r'"([\w{}]+\.png)"', script.read_text("utf-8"))]
+
+
 def written_pictures(block: Any, variables: dict[str, Any], settings: dict[str, Any]) -> str:
     """The PNG files that the last lines of a script wrote, oldest first, one below the other."""
-    folder, text = Path(variables["src_file"]).parent, ""
-    for picture in sorted(folder.glob("*.png"), key=lambda path: path.stat().st_mtime_ns):
+    script, text = Path(variables["src_file"]), ""
+    names = named_pictures(script)
+    own = [path for path in script.parent.glob("*.png") if any(fnmatch(path.name, name) for name in names)]
+    for picture in sorted(own, key=lambda path: path.stat().st_mtime_ns):
         place = Path(next(variables["image_path_iterator"]))
         shutil.move(picture, place)
         address = place.resolve().relative_to(settings["src_dir"]).as_posix()
@@ -144,11 +155,15 @@ def share(picture: Path) -> int:
 
 
 def tidy(settings: dict[str, Any], script: str | None) -> None:
-    """Remove the folders that scripts wrote: they are no sections of a gallery."""
-    for folder in {path.parent for path in COPIES.rglob("*.py")}:
-        for path in folder.iterdir():
-            if path.is_dir():
-                shutil.rmtree(path)
+    """Remove the folders of exported code beside a page that has one: they are no sections of a gallery.
+
+    Scripts that run at the same time write none: in sections, whose folders are not looked through, they may.
+    """
+    for path in COPIES.glob(f"*/{Path(script).name}") if script else ():
+        if EXPORTS in path.read_text("utf-8"):
+            for folder in path.parent.iterdir():
+                if folder.is_dir():
+                    shutil.rmtree(folder)
 
 
 SETTINGS = {
@@ -160,6 +175,7 @@ SETTINGS = {
     "image_scrapers": ["scripts.written_pictures"],
     "reset_modules": ["matplotlib", "scripts.tidy"],
     "reset_modules_order": "after",
+    "parallel": 2,
     "default_thumb_file": str(NO_PICTURE),
     "abort_on_example_error": True,
     "capture_repr": (),
@@ -187,6 +203,10 @@ def copy_scripts() -> None:
         for name in names:
             shutil.copy(EXAMPLES / f"{name}.py", section)
     shutil.copy(OWN / "gallery" / HEADER, COPIES / "gallery")
+    for one, other in combinations(sorted(COPIES.rglob("*.py")), 2):
+        names = [named_pictures(script) for script in (one, other)]
+        if one.parent == other.parent and any(fnmatch(a, b) or fnmatch(b, a) for a in names[0] for b in names[1]):
+            raise ExtensionError(f"{one.name} and {other.name} write a picture of the same name")
     for gallery in ("tutorial", "howto", "gallery"):
         pages = {path.relative_to(DOCS).with_suffix("") for path in (DOCS / gallery).rglob("*.py")}
         scripts = {path.relative_to(COPIES).with_suffix("") for path in (COPIES / gallery).rglob("*.py")}
@@ -197,8 +217,11 @@ def copy_scripts() -> None:
     no_picture.savefig(NO_PICTURE, dpi=100)
 
 
-def check_printed(app: Sphinx) -> None:
-    """A script that prints nothing shows nothing."""
+def check_shown(app: Sphinx) -> None:
+    """A script that prints nothing shows nothing, and a picture whose name no script tells is on no page."""
+    left = [str(picture.relative_to(COPIES)) for picture in COPIES.rglob("*/*.png")]
+    if left:
+        raise ExtensionError(f"{left} are on no page: scripts must name their pictures")
     for copy in COPIES.rglob("*.py"):
         page = DOCS / copy.relative_to(COPIES).with_suffix(".rst")
         if PRINTED not in page.read_text(encoding="utf-8"):
@@ -208,5 +231,5 @@ def check_printed(app: Sphinx) -> None:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Copy at once: sphinx-gallery looks at its folders when the configuration is read. Check when it has run."""
     copy_scripts()
-    app.connect("builder-inited", check_printed, priority=900)
+    app.connect("builder-inited", check_shown, priority=900)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
