@@ -57,7 +57,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_substeps
-from covocp.transcription.starts import own_start
+from covocp.transcription.starts import own_start, starts_kept
 
 if TYPE_CHECKING:
     from covocp.solving.suited_mesh import Beginning
@@ -242,7 +242,7 @@ class Solver(OtherStarts):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options, self.statement)
         guess = later_of(guess, elapsed)
         title = self.statement.name or "solving"
-        with evaluating(self.statement.name):
+        with evaluating(self.statement.name), starts_kept():
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 if isinstance(guess, str):
                     here, prepared = (self._solved, self._prepared.mesh, values), self._prepared

@@ -56,15 +56,6 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
 
 
-def numbered_columns(mesh: Mesh, u: Array, duration: float, parameters: Array) -> list[Array]:
-    """The same of numbers, controls a row each."""
-    n = mesh.intervals
-    start, end = control_ends(mesh, u.T)
-    reading = mesh.readings if mesh.readings.size else np.zeros((0, n))
-    rest = np.full((1, n), duration), np.tile(parameters[:, None], (1, n)), reading
-    return [start, end, mesh.nodes[None, :-1], np.diff(mesh.nodes)[None], *rest]
-
-
 @lru_cache(maxsize=MESHES)
 def _of_mesh(mesh: Mesh) -> tuple[ca.DM, ca.DM, ca.DM]:
     """Starts and lengths of the intervals of a mesh, and what they read, a column each."""
@@ -96,8 +87,7 @@ def shoot(
         intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     together = statement.matrices and (not mesh.eliminated or statement.coupled)
     start = ca.vertcat(variables.x, variables.e) if together else variables.x
-    advance = advancing(statement, mesh)
-    ends, fine, cost = _segments(statement, mesh, advance, start, intervals) if run is None else run
+    ends, fine, cost = _segments(statement, mesh, start, intervals) if run is None else run
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
     gaps = ends[:, last] - start[:, 1:]
@@ -130,8 +120,7 @@ def nominal_run(
     statement: Statement, mesh: Mesh, variables: Expr, intervals: Interval, *, compiled: bool = False
 ) -> tuple[Any, Any, Any]:
     """What `run` of `shoot` is where the nominal runs alone; `compiled`: in the library, where CasADi sees no steps."""
-    advance = nominal_interval(statement, mesh.substeps, mesh.step)
-    return _segments(statement, mesh, advance, variables.x, intervals, compiled=compiled)
+    return _segments(statement, mesh, variables.x, intervals, compiled=compiled, alone=True)
 
 
 def _inside(mesh: Mesh) -> list[int]:
@@ -141,15 +130,12 @@ def _inside(mesh: Mesh) -> list[int]:
 
 
 def _segments(
-    statement: Statement,
-    mesh: Mesh,
-    advance: ca.Function,
-    start: Expr,
-    intervals: Interval,
-    *,
-    compiled: bool = False,
+    statement: Statement, mesh: Mesh, start: Expr, intervals: Interval, *, compiled: bool = False, alone: bool = False
 ) -> tuple[Any, Any, Any]:
-    """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
+    """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length.
+
+    `alone`: of the nominal, whatever is beside it; `compiled`: as of `nominal_run`.
+    """
     ends: list[Any] = []
     fine: list[Any] = []
     costs: list[Any] = []
@@ -159,7 +145,7 @@ def _segments(
         count = mesh.segments.count(length)
         span = slice(first_interval, first_interval + count * length)
         given = [start[:, first_segment : first_segment + count], *(intervals if alike else intervals.columns(span))]
-        outputs = _in_sequence(statement, advance, given, (length, count), compiled=compiled)
+        outputs = _in_sequence(statement, mesh, given, (length, count), compiled=compiled, alone=alone)
         for collected, value in zip((ends, fine, costs), outputs, strict=True):
             collected.append(value)
         first_segment, first_interval = first_segment + count, span.stop
@@ -167,19 +153,41 @@ def _segments(
 
 
 def _in_sequence(
-    statement: Statement, advance: ca.Function, given: list[Any], size: tuple[int, int], *, compiled: bool
+    statement: Statement, mesh: Mesh, given: list[Any], size: tuple[int, int], *, compiled: bool, alone: bool
 ) -> list[Any]:
     """So many segments of so many intervals each, in the library where they are numbers or that is asked for."""
     length, count = size
-    if all(isinstance(value, ca.DM) for value in given):
-        numbers = [value.full() for value in given]
-        found = numbers_in_turn(statement, advance, numbers[0], numbers[1:], length)
-        if found is not None:
-            return [ca.DM(values) for values in found]
+    numbers = all(isinstance(value, ca.DM) for value in given)
+    alone = alone or (mesh.eliminated and not statement.coupled)
+    if alone and (numbers or compiled) and mesh.substeps > 1 and mesh.step != "rodas":
+        return _in_substeps(statement, mesh, given, size, numbers=numbers)
+    advance = nominal_interval(statement, mesh.substeps, mesh.step) if alone else advancing(statement, mesh)
+    found = _numbers(statement, advance, given, length) if numbers else None
+    if found is not None:
+        return found
     if compiled:
         return in_turn(statement, advance, length, count).call(given)
     function = sequence_of(advance, length)
     return (function.map(count) if count > 1 else function).call(given)
+
+
+def _in_substeps(
+    statement: Statement, mesh: Mesh, given: list[Any], size: tuple[int, int], *, numbers: bool
+) -> list[Any]:
+    """The same of the nominal step by step: one function for all numbers of substeps."""
+    (length, count), m = size, mesh.substeps
+    one = nominal_interval(statement, 1, mesh.step)
+    stepwise = [given[0], *Interval(*given[1:]).substeps(m)]
+    found = _numbers(statement, one, stepwise, length * m) if numbers else None
+    after, _, costs = in_turn(statement, one, length * m, count).call(stepwise) if found is None else found
+    return [after[:, m - 1 :: m], after, ca.sum1(ca.reshape(ca.densify(costs), m, length * count))]
+
+
+def _numbers(statement: Statement, advance: ca.Function, given: list[Any], steps: int) -> list[Any] | None:
+    """What the library makes of numbers, None where it cannot."""
+    first, *columns = (value.full() for value in given)
+    found = numbers_in_turn(statement, advance, first, columns, steps)
+    return None if found is None else [ca.DM(values) for values in found]
 
 
 def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
@@ -280,8 +288,7 @@ def _substeps(statement: Statement, mesh: Mesh, x: Expr, fine: Expr, intervals: 
 def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
     """Half-vectors at the start of the matrices that run backward, where they are no variables; as `shoot` has them."""
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-    advance = nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, _ = _segments(statement, mesh, advance, variables.x, intervals)
+    ends, fine, _ = _segments(statement, mesh, variables.x, intervals, alone=True)
     columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
     assert statement.matrix_end is not None
     last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)

@@ -16,7 +16,7 @@ import numpy as np
 
 from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
-from covocp.base.expressions import Expr, plus, times
+from covocp.base.expressions import Expr, minus, plus, times
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
@@ -29,6 +29,8 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps
 from covocp.transcription.steps import nominal_interval
 
+# Shares of a step at which its stages are.
+STAGES = (0.0, 0.5, 0.5, 1.0)
 # States from which on it is less work where no covariance passes in compiled code.
 SMALLEST_ALONE = 4
 
@@ -92,7 +94,7 @@ def staged(
     """
     x, fine = states
     nx, nu, free = statement.nx, statement.nu, int(statement.duration.free)
-    function, pattern = _stage_slopes(statement, mesh.substeps)
+    function, pattern = _stage_slopes(statement, whole=mesh.substeps == 1)
     linear = mesh.control == "linear"
     active, places, spans = [], [], []
     first_control = starts.numel() + free
@@ -121,7 +123,7 @@ def staged(
     )
     return Staged(
         steps=steps,
-        slopes=in_columns(statement, function, mesh.intervals)(x[:, : mesh.intervals], fine, *intervals),
+        slopes=_slopes_along(statement, mesh, function, x, fine, intervals),
         count=len(mesh.segments),
         spans=tuple(spans),
         linear=constant[rows, :],
@@ -143,7 +145,7 @@ def interval_transitions(statement: Statement, mesh: Mesh, x: Array, intervals: 
     n, nx, nu, free = mesh.intervals, statement.nx, statement.nu, int(statement.duration.free)
     run = Matrices(nominal_interval(statement, mesh.substeps, mesh.step).map(n))
     fine = run.evaluated(x, *intervals)[1]
-    function, pattern = _stage_slopes(statement, mesh.substeps)
+    function, pattern = _stage_slopes(statement, whole=mesh.substeps == 1)
     rest = (*range(nx + free, nx + free + 2 * nu), *range(nx, nx + free))
     steps = Steps(
         rows=nx,
@@ -153,40 +155,53 @@ def interval_transitions(statement: Statement, mesh: Mesh, x: Array, intervals: 
         places=(rest,) * n,
         active=(nx + free + 2 * nu,) * n,
     )
-    slopes = in_columns(statement, function, n)(x, fine, *intervals)
+    slopes = _slopes_along(statement, mesh, function, ca.DM(x), ca.DM(fine), Interval(*map(ca.DM, intervals)))
     values = stacked(transitions(steps, slopes), n)
     return values[..., :nx], values[..., nx + free : nx + free + nu], values[..., nx + free + nu :]
 
 
+def _slopes_along(
+    statement: Statement, mesh: Mesh, function: ca.Function, x: Expr, fine: Expr, intervals: Interval
+) -> Any:
+    """What `_stage_slopes` gives along all steps: x at the nodes, fine at the ends of the substeps, a column each."""
+    n, m = mesh.intervals, mesh.substeps
+    before = x[:, :n]
+    if m == 1:
+        return in_columns(statement, function, n).call([before, *intervals])[0]
+    inside: Expr = ca.reshape(fine, statement.nx * m, n)
+    before = ca.reshape(ca.vertcat(before, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
+    shares = ca.DM(np.tile([[(j + c) / m for j in range(m)] for c in STAGES], (1, n)))
+    return in_columns(statement, function, n * m).call([before, *intervals.substeps(m), shares])[0]
+
+
 @lru_cache(maxsize=KEPT)
-def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Slopes of h times the rates of state and cost at the stages of all steps of an interval.
+def _stage_slopes(statement: Statement, *, whole: bool) -> tuple[ca.Function, tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Slopes of h times the rates of state and cost at the stages of a step.
 
     Returns:
-        (x, states at the ends of the substeps, *interval) -> nonzeros of the slopes by the state, by the controls at
-        both ends and, where it is free, by T, a column for each stage; rows and columns of the nonzeros.
+        (x, *interval: of the step, shares of the control interval at its stages unless it is a `whole` one) -> nonzeros
+        of the slopes by the state, by the controls at both ends and, where it is free, by T, a column for each stage;
+        rows and columns of the nonzeros.
     """
     symbolic: Any = statement.symbolic
-    x, fine = symbolic.sym("x", statement.nx), symbolic.sym("fine", statement.nx, substeps)
-    interval, rates = Interval.symbols(statement), _rate_slopes(statement)
+    x, part, rates = symbolic.sym("x", statement.nx), Interval.symbols(statement), _rate_slopes(statement)
+    shares = symbolic.sym("shares", 0 if whole else len(STAGES))
+    stages: list[Any] = []
+
+    def rate(value: Expr, c: float) -> Expr:
+        stages.append((value, c))
+        return statement.nominal.call(part.at(c, value))[0]  # type: ignore[union-attr]
+
+    classical_step(rate, x, part.h)
     found = []
-    for j in range(substeps):
-        part = interval.part(j / substeps, (j + 1) / substeps)
-        stages: list[Any] = []
-
-        def rate(value: Expr, c: float, part: Interval = part, stages: list[Any] = stages) -> Expr:
-            stages.append((value, c))
-            return statement.nominal.call(part.at(c, value))[0]  # type: ignore[union-attr]
-
-        classical_step(rate, x if j == 0 else fine[:, j - 1], part.h)
-        for value, c in stages:
-            moved, by_x, by_u, by_time, by_duration = rates.call(part.at(c, value))
-            share, h = (j + c) / substeps, part.h
-            blocks = [times(h, by_x), times(times(1 - share, h), by_u), times(times(share, h), by_u)]
-            if statement.duration.free:
-                own = plus(times(by_time, part.place(c)), by_duration)
-                blocks.append(plus(times(part.ds, moved), times(h, own)))
-            found.append(ca.horzcat(*blocks))
+    for k, (value, c) in enumerate(stages):
+        moved, by_x, by_u, by_time, by_duration = rates.call(part.at(c, value))
+        share, h = c if whole else shares[k], part.h
+        blocks = [times(h, by_x), times(times(minus(1, share), h), by_u), times(times(share, h), by_u)]
+        if statement.duration.free:
+            own = plus(times(by_time, part.place(c)), by_duration)
+            blocks.append(plus(times(part.ds, moved), times(h, own)))
+        found.append(ca.horzcat(*blocks))
     pattern = found[0].sparsity()
     for slope in found:
         pattern = pattern + slope.sparsity()
@@ -195,7 +210,10 @@ def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tup
         *(s.nz[:] if s.sparsity() == pattern else ca.sparsity_cast(ca.project(s, pattern), shape) for s in found)
     )
     row, column = pattern.get_triplet()
-    function = ca.Function("stage_slopes", [x, fine, *interval], [columns], slopes_wanted(statement, 2))
+    given, wanted = [x, *part], slopes_wanted(statement, 1)
+    if not whole:
+        given, wanted = [*given, shares], {"is_diff_in": [*wanted["is_diff_in"], False]}
+    function = ca.Function("stage_slopes", given, [columns], wanted)
     return function, (tuple(row), tuple(column))
 
 

@@ -6,6 +6,9 @@ and Newton bring them to their final values. What else there is to start from is
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
 
@@ -81,14 +84,37 @@ class First:
     __repr__ = short_repr
 
 
+# The starts of the solve that is going on.
+_KEPT_STARTS: ContextVar[dict[tuple[Statement, Mesh, tuple[float, ...], bool], First] | None] = ContextVar(
+    "kept_starts", default=None
+)
+
+
 def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool = True) -> First:
     """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated.
 
     Where the nominal is unstable and would stay so a feedback holds it, unless it is asked to be left to itself.
-    The last ones are kept, unless a guess may have changed since (a function, an array that is filled anew): a solver
-    that is asked again for the same parameters starts from the same.
+    The last ones are kept: a solver that is asked again for the same parameters starts from the same. Where a guess may
+    have changed since (a function, an array that is filled anew) they are within one solve (`starts_kept`).
     """
-    return (_own_start if stays(statement) else _own_start.__wrapped__)(statement, mesh, tuple(parameters), hold)
+    key, kept = (statement, mesh, tuple(parameters), hold), _KEPT_STARTS.get()
+    if stays(statement):
+        return _own_start(*key)
+    if kept is None:
+        return _own_start.__wrapped__(*key)
+    if key not in kept:
+        kept[key] = _own_start.__wrapped__(*key)
+    return kept[key]
+
+
+@contextmanager
+def starts_kept() -> Iterator[None]:
+    """Within it no guess changes: each start is made once."""
+    token = _KEPT_STARTS.set({})
+    try:
+        yield
+    finally:
+        _KEPT_STARTS.reset(token)
 
 
 def stays(statement: Statement) -> bool:
