@@ -15,7 +15,6 @@ import numpy as np
 
 from covocp.base.expressions import Expr, beside, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array
 from covocp.passage.columns import in_turn, numbers_in_turn
 from covocp.passage.library import functions
 from covocp.passage.sweep import passed_by, values_by
