@@ -45,7 +45,7 @@ def integrated(solution, rate):
 
 @cache
 def as_declared(method, rate):
-    return co.solve(actuator(rate), method, intervals=20, progress=False)
+    return co.solve(actuator(rate), method, intervals=40, progress=False)
 
 
 # At 22 the explicit step of the declared rate is beyond its limit of stability (7.4 % off), at 200 far beyond.
@@ -53,7 +53,7 @@ def as_declared(method, rate):
 @pytest.mark.parametrize("rate", [22.0, 200.0])
 @pytest.mark.parametrize("assess", [True, False])
 def test_a_stiffer_plant_is_solved_as_if_it_had_been_declared(method, rate, assess):
-    solver = co.Solver(actuator(), method, intervals=20)
+    solver = co.Solver(actuator(), method, intervals=40)
     solution = solver.solve({"k": rate}, progress=False, assess=assess)
     assert abs(solution.cost / integrated(solution, rate) - 1) <= 1e-5
     declared = as_declared(method, rate)
