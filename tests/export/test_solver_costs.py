@@ -151,7 +151,7 @@ def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimu
         ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
         return ocp
 
-    planner = export_c(make(), FOLDER / f"prior_{method}", intervals=20, method=method).reference()
+    planner = export_c(make(), FOLDER / f"prior_{method}", intervals=12, method=method).reference()
     for start in ({}, {"initial_x": 1.5}, {"initial_x": -1.5}, {"initial_x": 1.0}):
         plan = planner(**start)
         right = float(plan["cost"]) == pytest.approx(optimum(moved(make(), start), plan), rel=SAME)

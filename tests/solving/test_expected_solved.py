@@ -382,6 +382,7 @@ def pushed_away(duration):
     return ocp
 
 
+@cache
 def cost_of_the_noise(duration):
     """1/2 (tr S(0) E(0) + int tr S Q + int tr E C' C), S and E by scipy."""
     drift, input_, noise = np.array([[0.0, 1.0], [0.5, 0.0]]), np.array([[0.0], [1.0]]), np.diag([0.0, 0.3])
@@ -391,7 +392,7 @@ def cost_of_the_noise(duration):
         S = s.reshape(2, 2)
         return (drift.T @ S + S @ drift + weight - S @ input_ @ input_.T @ S).ravel()
 
-    options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-12}
+    options = {"method": "LSODA", "rtol": 1e-10, "atol": 1e-12}
     S = solve_ivp(back, (0.0, duration), np.zeros(4), dense_output=True, **options).sol
 
     def ahead(t, values):

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -293,14 +294,15 @@ def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, 
     x, e = _states_at(solution, grid.t)
     read = readings_of(solution, grid)
     _read_in_parts(solution, grid, x, e, read)
+    at_all = Matrices(chosen.function.map(grid.steps))  # of both sides: made once
     sides = []
     for part in (slice(0, -1), slice(1, None)):
         t = grid.t[part]
         u = _controls_at(solution, t, grid.interval)
         at = Nominal(x=x[part], u=u, e=e[part], t=t, told=_inside(solution, t, grid.interval))
         columns = at.columns(solution.duration, solution.parameters)
-        values = chosen.function.map(grid.steps)(*columns, grid.h[None, :], read)
-        sides.append(np.ascontiguousarray(values.full().T))
+        (values,) = at_all.evaluated(*columns, grid.h[None, :], read)
+        sides.append(np.ascontiguousarray(values.T))
     return sides[0], sides[1]
 
 
