@@ -15,7 +15,7 @@ import covocp as co
 from covocp.base.buffered import Buffered
 from covocp.models import mass_chain
 from covocp.passage import columns, library, operations
-from covocp.passage.columns import FEWEST, in_columns
+from covocp.passage.columns import FEWEST, in_columns, in_turn, numbers_in_turn
 from covocp.transcription.covariance_steps import KEPT, gauss_points
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -95,7 +95,7 @@ def test_a_value_that_is_assigned_is_the_same():
     constants, heights, given = np.zeros(3), np.array([1, 1], np.intc), np.arange(40.0)
     result = np.full(40, np.nan)
     places = (ctypes.c_void_p * 2)(given.ctypes.data, result.ctypes.data)
-    told = (3, rows.ctypes.data, constants.ctypes.data, 2, 1, heights.ctypes.data, places, 40)
+    told = (3, rows.ctypes.data, constants.ctypes.data, 2, 1, heights.ctypes.data, places, 1, 40)
     assert library.needed()["columns"](*told) == 0
     np.testing.assert_array_equal(result, given)
 
@@ -151,6 +151,73 @@ def test_derivatives_are_those_of_the_map(which: str):
     np.testing.assert_allclose(own, expected, rtol=1e-14, atol=1e-14)
     if which == "jacobian":
         assert made[0].sparsity_out(0) == made[1].sparsity_out(0)
+
+
+def advancing() -> ca.Function:
+    """A step of a value, with a matrix and a result without entries beside it; an argument without rows among others."""
+    x, u, none, m = ca.SX.sym("x", 3), ca.SX.sym("u", 2), ca.SX.sym("none", 0), ca.SX.sym("m", 2, 2)
+    rate = ca.vertcat(ca.sin(x[1]), u[0] * x[2], ca.exp(u[1]) - x[0]) + (m @ u)[1]
+    after = x + 0.1 * rate
+    return ca.Function("advancing", [x, u, none, m], [after, ca.horzcat(x, after), ca.SX(1, 1), x[0] * x[1]])
+
+
+# Steps and sequences: as few and as many as are worked on by themselves, some at a time and most at a time.
+SEQUENCES = ((1, 1), (7, 1), (50, 1), (5, 2), (3, 16), (3, 17), (4, 33), (1, 40))
+
+
+@pytest.mark.parametrize(("steps", "sequences"), SEQUENCES)
+def test_sequences_are_those_of_casadi(steps: int, sequences: int):
+    """Bit by bit, as a node and of numbers alone."""
+    owner, function = Owner(), advancing()
+    plain = function.mapaccum(steps) if steps > 1 else function
+    plain = plain.map(sequences) if sequences > 1 else plain
+    node = in_turn(owner, function, steps, sequences)
+    assert node.class_name() == "CallbackInternal"
+    assert [node.sparsity_in(i) for i in range(node.n_in())] == [plain.sparsity_in(i) for i in range(plain.n_in())]
+    assert [node.sparsity_out(i) for i in range(node.n_out())] == [plain.sparsity_out(i) for i in range(plain.n_out())]
+    given = [np.random.default_rng(3).normal(size=plain.size_in(i)) for i in range(plain.n_in())]
+    expected = [value.full() for value in plain.call([ca.DM(value) for value in given])]
+    numbers = numbers_in_turn(owner, function, given[0], given[1:], steps)
+    assert numbers is not None
+    for own, alone, other in zip(node.call([ca.DM(v) for v in given]), numbers, expected, strict=True):
+        np.testing.assert_array_equal(own.full(), other)
+        np.testing.assert_array_equal(alone, other)
+
+
+@pytest.mark.parametrize("which", ["gradient", "tangent", "jacobian"])
+@pytest.mark.parametrize("sequences", [1, 3])
+def test_derivatives_of_sequences_are_those_of_casadi(which: str, sequences: int):
+    """With the sparsity that steps have: later controls change no earlier value."""
+    owner, function, steps = Owner(), advancing(), 6
+    plain = function.mapaccum(steps)
+    made = []
+    for turned in (in_turn(owner, function, steps, sequences), plain.map(sequences) if sequences > 1 else plain):
+        given = [ca.MX.sym(f"a{i}", *turned.size_in(i)) for i in range(turned.n_in())]
+        after, _, _, products = turned.call(given)
+        number = ca.sumsqr(after) + ca.sum2(ca.cos(products))
+        result = {
+            "gradient": lambda u=given[1], number=number: ca.gradient(number, u),
+            "tangent": lambda u=given[1], after=after: ca.jtimes(after, u, ca.sin(u)),
+            "jacobian": lambda u=given[1], after=after: ca.jacobian(ca.vec(after), ca.vec(u)),
+        }[which]()
+        made.append(ca.Function("f", given, [result]))
+    rng = np.random.default_rng(5)
+    values = [ca.DM(rng.normal(size=made[0].size_in(i))) for i in range(made[0].n_in())]
+    own, expected = (function.call(values)[0] for function in made)
+    np.testing.assert_allclose(own.full(), expected.full(), rtol=1e-13, atol=1e-14)
+    assert made[0].sparsity_out(0) == made[1].sparsity_out(0)
+
+
+def test_what_is_no_step_of_a_dense_value_stays_casadis():
+    """Another height, entries that are left out, and functions that are not of scalars."""
+    owner, x = Owner(), ca.SX.sym("x", 2)
+    whole, part = ca.Function("whole", [x], [ca.sin(x)]), ca.Function("part", [x], [ca.vertcat(x[0], ca.SX(1, 1))])
+    m = ca.MX.sym("m", 2)
+    other = ca.Function("other", [m], [ca.norm_fro(m) * m])
+    assert in_turn(owner, whole, 5, 1).class_name() == "CallbackInternal"
+    for function in (part, other):
+        assert in_turn(owner, function, 5, 1).class_name() != "CallbackInternal"
+        assert numbers_in_turn(owner, function, np.ones((2, 1)), [], 5) is None
 
 
 def test_few_columns_and_other_functions_stay_maps():
