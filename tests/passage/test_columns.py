@@ -154,7 +154,7 @@ def test_derivatives_are_those_of_the_map(which: str):
 
 
 def advancing() -> ca.Function:
-    """A step of a value, with a matrix and a result without entries beside it; an argument without rows among others."""
+    """A step of a value, with a matrix, a result without entries, and an argument without rows."""
     x, u, none, m = ca.SX.sym("x", 3), ca.SX.sym("u", 2), ca.SX.sym("none", 0), ca.SX.sym("m", 2, 2)
     rate = ca.vertcat(ca.sin(x[1]), u[0] * x[2], ca.exp(u[1]) - x[0]) + (m @ u)[1]
     after = x + 0.1 * rate
