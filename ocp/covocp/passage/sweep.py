@@ -163,6 +163,7 @@ class _Workspaces:
 
     def __init__(self) -> None:
         self._kept: list[tuple[_Sweep, int, int]] = []  # and the bytes that each memory has
+        self._held = 0  # by all of them
         self._lock = threading.Lock()
 
     def take(self, sweep: _Sweep) -> int:
@@ -170,20 +171,28 @@ class _Workspaces:
         with self._lock:
             for place in range(len(self._kept) - 1, -1, -1):
                 if self._kept[place][0] is sweep:
-                    return self._kept.pop(place)[1]
+                    return self._taken(place)
             self._free(sweep.bytes, 0)
         return sweep.new_memory()
 
     def give(self, sweep: _Sweep, memory: int) -> None:
         """Keep memory for the next call, and free the oldest where it has become too much."""
         with self._lock:
-            self._kept.append((sweep, memory, int(needed()["passage_held"](memory))))
+            held = int(needed()["passage_held"](memory))
+            self._kept.append((sweep, memory, held))
+            self._held += held
             self._free(0, 1)
+
+    def _taken(self, place: int) -> int:
+        """The memory at a place, which is no longer kept."""
+        _, memory, held = self._kept.pop(place)
+        self._held -= held
+        return memory
 
     def _free(self, more: int, least: int) -> None:
         """Free the oldest, down to so many, until there is room for more bytes."""
-        while len(self._kept) > least and more + sum(held for *_, held in self._kept) > KEPT_BYTES:
-            needed()["passage_free"](self._kept.pop(0)[1])
+        while len(self._kept) > least and more + self._held > KEPT_BYTES:
+            needed()["passage_free"](self._taken(0))
 
 
 _WORKSPACES = _Workspaces()
