@@ -73,7 +73,7 @@ def along_lag(solution, noise, t):
 
     for k in range(nodes.size - 1):
         inside = (t >= nodes[k]) & (t <= nodes[k + 1])
-        found = solve_ivp(rates, nodes[k : k + 2], z, method="Radau", rtol=1e-10, atol=1e-13, dense_output=True)
+        found = solve_ivp(rates, nodes[k : k + 2], z, method="LSODA", rtol=1e-10, atol=1e-13, dense_output=True)
         result[inside], z = found.sol(t[inside]).T, found.y[:, -1]
     return result[:, 0], result[:, 1:].reshape(-1, 2, 2)
 

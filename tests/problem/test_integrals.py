@@ -115,7 +115,7 @@ def by_scipy(prior, density, duration, controls):
         return np.concatenate([[-x + controls(t)], growth.ravel(), [E[1, 1] + 0.1 * x**2 * E[0, 0]]])
 
     start = np.concatenate([[1.0], np.diag([prior, 2.0]).ravel(), [0.0]])
-    end = solve_ivp(rate, (0.0, duration), start, method="Radau", rtol=1e-11, atol=1e-13).y[:, -1]
+    end = solve_ivp(rate, (0.0, duration), start, method="LSODA", rtol=1e-11, atol=1e-13).y[:, -1]
     return end[5], end[1:5].reshape(2, 2)
 
 

@@ -35,7 +35,7 @@ def regulated(drift, start, variance, noise, measured, weight, price, duration, 
     size = drift.shape[0]
     enters = np.eye(size)[:, [-1]] if enters is None else enters
     seen = np.eye(size)[[0]] if seen is None else seen
-    options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-14}
+    options = {"method": "LSODA", "rtol": 1e-10, "atol": 1e-14}
 
     def back(_, values):
         S = values.reshape(size, size)
