@@ -117,7 +117,20 @@ def _along_of_casadi(statement: Statement, mesh: Mesh) -> Matrices:
 def compiled_along(
     statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
 ) -> tuple[Array, float] | None:
-    """The same by the compiled library, controls a row each; None where that cannot take the model."""
+    """The nominal along controls by the compiled library.
+
+    Args:
+        statement: a problem whose nominal runs alone.
+        mesh: of it.
+        start: state where it begins, (nx,).
+        u: controls, (nodes, nu).
+        duration: T [s].
+        parameters: of the statement.
+
+    Returns:
+        States at the ends of the intervals (nx, N) and the integral of the running cost, 0 where that depends on the
+        matrices; None where the library cannot take the model.
+    """
     parts = mesh.substeps if mesh.step != "rodas" else 1  # step by step: one function for all numbers of substeps
     advance = nominal_interval(statement, mesh.substeps // parts, mesh.step)
     columns = _columns_of_parts(mesh, parts, u.T, duration, parameters)
@@ -160,6 +173,7 @@ def _beside(each: list[Array]) -> Array:
 def _numbers_along(
     statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
 ) -> tuple[Array, float]:
+    """The same, by CasADi where the library cannot."""
     found = compiled_along(statement, mesh, start, u, duration, parameters)
     if found is not None:
         return found
