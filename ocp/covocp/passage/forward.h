@@ -39,7 +39,7 @@ static void solve_full(
         assemble(p, n, k, E, w, a);
         for (int i = 0; right && i < m; ++i) memcpy(a + i * w + m, right + i * columns, sizeof(double) * columns);
         if (exchanging)
-            eliminate(a, m, w, NULL);
+            eliminate(a, m, w, NULL, p->tall);
         else if (eliminate_steady(a, m, w, p->sizes))
             return;
     }
@@ -118,9 +118,8 @@ static int step(const Passage *p, int n, int k, double *RESTRICT E) {
         for (int j = 0; j < n; ++j) b[i * m + n + j] += E[i * n + j];
     }
     for (int i = 0; i < m * n; ++i) Y2[i] = Y1[i] + 2.0 * GAP * Y2[i];
-    eliminate(b, n, m, swaps);
+    eliminate_symmetric(b, n, swaps, p->tall, a, E);
     for (int i = 0; i < n; ++i) memcpy(factor + i * n, b + i * m, sizeof(double) * n);
-    symmetric_part(b + n, m, n, a, E);
     return transition;
 }
 
@@ -141,7 +140,7 @@ static void reading(Passage *p, int n, int j, double *RESTRICT E) {
         for (int c = 0; c < r; ++c) a[i * w + c] = S[i * r + c] + R[i * r + c], a[i * w + r + c] = i == c;
         memcpy(a + i * w + 2 * r, seen + i * n, sizeof(double) * n);
     }
-    eliminate(a, r, w, NULL);
+    eliminate(a, r, w, NULL, p->tall);
     for (int i = 0; i < r; ++i) {
         memcpy(S + i * r, a + i * w + r, sizeof(double) * r);
         for (int c = 0; c < n; ++c) K[c * r + i] = a[i * w + 2 * r + c];

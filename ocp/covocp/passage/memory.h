@@ -51,6 +51,8 @@ static const double SHARE = 0.5 - 2.0 * 0.28867513459481287;
 static const double MUCH = 100.0;
 /* Steps whose systems are made triangular side by side. */
 enum { MOST_LANES = 8 };
+/* Columns that are made triangular at a time, rows that are solved so. */
+enum { PANEL = 8 };
 
 /* Steps of a covariance and where their numbers lie.
  *
@@ -85,6 +87,7 @@ typedef struct {
     double *stage1, *stage2;      /* of every step, 2n x n, row by row; of one unless all are kept */
     double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */
     double *work, *sizes, *values; /* to work in; `sizes`: of the diagonal of a full system */
+    double *tall;                  /* to work in: some columns of a system, see `panel` */
 } Passage;
 
 /* Where the factors of X' of step k are among those that are kept. */

@@ -31,6 +31,7 @@ static size_t works(Passage *p, double *memory) {
     size_t used = 0;
     p->work = placed(memory, &used, 17 * n * n + 4 * (r * r + r * n));
     p->sizes = placed(memory, &used, 2 * n);
+    p->tall = placed(memory, &used, PANEL * (2 * n + r));
     if (!p->order) return used;
     p->values = placed(memory, &used, (2 * (size_t)p->nnz + 2 * n + factors_length(p)) * p->lanes);
     if (!p->brief) p->factors = placed(memory, &used, factors_length(p) * p->lanes);

@@ -183,6 +183,37 @@ INLINE void add_product(
         add_rows(C + (size_t)i * wide, sign, A + (size_t)i * tall, step, B, across, inner, columns);
 }
 
+#if defined(__AVX2__) && defined(__GNUC__)
+/* B <- A' of four rows and columns. */
+INLINE void turn_four(const double *A, int across, double *B, int wide) {
+    const __m256d a = _mm256_loadu_pd(A), b = _mm256_loadu_pd(A + across), c = _mm256_loadu_pd(A + 2 * (size_t)across),
+                  d = _mm256_loadu_pd(A + 3 * (size_t)across);
+    const __m256d ab = _mm256_unpacklo_pd(a, b), ba = _mm256_unpackhi_pd(a, b);
+    const __m256d cd = _mm256_unpacklo_pd(c, d), dc = _mm256_unpackhi_pd(c, d);
+    _mm256_storeu_pd(B, _mm256_permute2f128_pd(ab, cd, 0x20));
+    _mm256_storeu_pd(B + wide, _mm256_permute2f128_pd(ba, dc, 0x20));
+    _mm256_storeu_pd(B + 2 * (size_t)wide, _mm256_permute2f128_pd(ab, cd, 0x31));
+    _mm256_storeu_pd(B + 3 * (size_t)wide, _mm256_permute2f128_pd(ba, dc, 0x31));
+}
+#endif
+
+/* B <- A', A (rows x columns): rows lie `across` and `wide` apart; squares of it at a time, which stay in the cache. */
+static void turn(const double *RESTRICT A, int across, int rows, int columns, double *RESTRICT B, int wide) {
+    enum { SIDE = 4 };
+    for (int i = 0; i < rows; i += SIDE)
+        for (int j = 0; j < columns; j += SIDE) {
+            const int last = i + SIDE < rows ? i + SIDE : rows, end = j + SIDE < columns ? j + SIDE : columns;
+#if defined(__AVX2__) && defined(__GNUC__)
+            if (i + SIDE <= rows && j + SIDE <= columns) {
+                turn_four(A + (size_t)i * across + j, across, B + (size_t)j * wide + i, wide);
+                continue;
+            }
+#endif
+            for (int c = j; c < end; ++c)
+                for (int r = i; r < last; ++r) B[(size_t)c * wide + r] = A[(size_t)r * across + c];
+        }
+}
+
 /* Two rows of w entries change places. */
 INLINE void exchange(double *RESTRICT a, int w, int one, int other) {
     for (int j = 0; one != other && j < w; ++j) {
@@ -191,25 +222,40 @@ INLINE void exchange(double *RESTRICT a, int w, int one, int other) {
     }
 }
 
-/* Columns `begin` to `end` of m rows made triangular with partial pivoting of whole rows of w entries. */
-INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, double *RESTRICT swaps) {
-    for (int k = begin; k < end; ++k) {
+/* Columns `begin` to `end` of m rows made triangular with partial pivoting of whole rows of w entries.
+ *
+ * In `tall` (m of each) they lie column after column: what is done to all rows below a pivot is side by side.
+ */
+INLINE void panel(
+    double *RESTRICT a, int m, int w, int begin, int end, double *RESTRICT swaps, double *RESTRICT tall
+) {
+    const int rows = m - begin, columns = end - begin;
+    double *corner = a + (size_t)begin * w + begin;
+    turn(corner, w, rows, columns, tall, rows);
+    for (int k = 0; k < columns; ++k) {
+        double *RESTRICT own = tall + (size_t)k * rows;
         int pivot = k;
-        double largest = fabs(a[k * w + k]);
-        for (int i = k + 1; i < m; ++i) {
-            const double size = fabs(a[i * w + k]);
+        double largest = fabs(own[k]);
+        for (int i = k + 1; i < rows; ++i) {
+            const double size = fabs(own[i]);
             if (size > largest) largest = size, pivot = i;
         }
-        if (swaps) swaps[k] = pivot;
-        exchange(a, w, k, pivot);
-        const double inverse = 1.0 / a[k * w + k];
-        for (int i = k + 1; i < m; ++i) {
-            double *own = a + i * w;
-            if (own[k] == 0.0) continue;
-            own[k] *= inverse;
-            for (int j = k + 1; j < end; ++j) own[j] -= own[k] * a[k * w + j];
+        if (swaps) swaps[begin + k] = begin + pivot;
+        exchange(a, w, begin + k, begin + pivot);
+        for (int j = 0; pivot != k && j < columns; ++j) {
+            double *RESTRICT column = tall + (size_t)j * rows;
+            const double kept = column[k];
+            column[k] = column[pivot], column[pivot] = kept;
+        }
+        const double inverse = 1.0 / own[k];
+        for (int i = k + 1; i < rows; ++i) own[i] *= inverse;
+        for (int j = k + 1; j < columns; ++j) {
+            double *RESTRICT other = tall + (size_t)j * rows;
+            const double share = other[k];
+            for (int i = k + 1; i < rows; ++i) other[i] -= own[i] * share;
         }
     }
+    turn(tall, rows, columns, rows, corner, w);
 }
 
 /* The columns past the first m solved, which are triangular, two rows at a time from the last on. */
@@ -230,13 +276,13 @@ INLINE void solve_upper(double *RESTRICT a, int m, int w) {
     }
 }
 
-/* Columns that are made triangular at a time, rows that are solved so; rows below which they are solved in pairs. */
-enum { PANEL = 8, FEW_ROWS = 20 };
+/* Rows below which they are solved in pairs. */
+enum { FEW_ROWS = 20 };
 
-/* The same, some rows at a time where blocks of sums are faster. */
-INLINE void solve_blocks(double *RESTRICT a, int m, int w) {
-    const int columns = w - m;
+/* The same, some rows at a time where blocks of sums are faster; `lower`: of each row no more than up to its diagonal. */
+INLINE void solve_blocks(double *RESTRICT a, int m, int w, const int lower) {
     for (int end = m, begin; end > 0; end = begin) {
+        const int columns = lower ? end : w - m;
         begin = end > PANEL ? end - PANEL : 0;
         double *first = a + begin * w, *done = a + end * w + m;
         add_product(first + m, w, -1.0, first + end, w, 1, done, w, end - begin, m - end, columns);
@@ -244,7 +290,7 @@ INLINE void solve_blocks(double *RESTRICT a, int m, int w) {
             double *RESTRICT own = a + k * w;
             add_rows(own + m, -1.0, own + k + 1, 1, own + w + m, w, end - 1 - k, columns);
             const double inverse = 1.0 / own[k];
-            for (int j = m; j < w; ++j) own[j] *= inverse;
+            for (int j = m; j < m + columns; ++j) own[j] *= inverse;
         }
     }
 }
@@ -252,21 +298,26 @@ INLINE void solve_blocks(double *RESTRICT a, int m, int w) {
 /* What is left of `m` rows that were made triangular. */
 INLINE void solve_rest(double *RESTRICT a, int m, int w) {
     if (TALL > 2 && m >= FEW_ROWS)
-        solve_blocks(a, m, w);
+        solve_blocks(a, m, w, 0);
     else
         solve_upper(a, m, w);
 }
 
-/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL), the
- * others solved. */
-static void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) {
+/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL); `tall`:
+ * PANEL times m to work in. */
+INLINE void make_triangular(double *RESTRICT a, int m, int w, double *RESTRICT swaps, double *RESTRICT tall) {
     for (int k = 0; k < m; k += PANEL) {
         const int end = k + PANEL < m ? k + PANEL : m;
-        panel(a, m, w, k, end, swaps);
+        panel(a, m, w, k, end, swaps, tall);
         for (int i = k + 1; i < end; ++i)
             add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
         add_product(a + end * w + end, w, -1.0, a + end * w + k, w, 1, a + k * w + end, w, m - end, end - k, w - end);
     }
+}
+
+/* The same, and the other columns solved. */
+static void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps, double *RESTRICT tall) {
+    make_triangular(a, m, w, swaps, tall);
     solve_rest(a, m, w);
 }
 
@@ -309,42 +360,27 @@ INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) 
         for (int i = j; i < n; ++i, ++t) square[i * n + j] = square[j * n + i] = half[t];
 }
 
-#if defined(__AVX2__) && defined(__GNUC__)
-/* B <- A' of four rows and columns. */
-INLINE void turn_four(const double *A, int across, double *B, int wide) {
-    const __m256d a = _mm256_loadu_pd(A), b = _mm256_loadu_pd(A + across), c = _mm256_loadu_pd(A + 2 * (size_t)across),
-                  d = _mm256_loadu_pd(A + 3 * (size_t)across);
-    const __m256d ab = _mm256_unpacklo_pd(a, b), ba = _mm256_unpackhi_pd(a, b);
-    const __m256d cd = _mm256_unpacklo_pd(c, d), dc = _mm256_unpackhi_pd(c, d);
-    _mm256_storeu_pd(B, _mm256_permute2f128_pd(ab, cd, 0x20));
-    _mm256_storeu_pd(B + wide, _mm256_permute2f128_pd(ba, dc, 0x20));
-    _mm256_storeu_pd(B + 2 * (size_t)wide, _mm256_permute2f128_pd(ab, cd, 0x31));
-    _mm256_storeu_pd(B + 3 * (size_t)wide, _mm256_permute2f128_pd(ba, dc, 0x31));
-}
-#endif
-
-/* B <- A', A (rows x columns): rows lie `across` and `wide` apart; squares of it at a time, which stay in the cache. */
-static void turn(const double *RESTRICT A, int across, int rows, int columns, double *RESTRICT B, int wide) {
-    enum { SIDE = 4 };
-    for (int i = 0; i < rows; i += SIDE)
-        for (int j = 0; j < columns; j += SIDE) {
-            const int last = i + SIDE < rows ? i + SIDE : rows, end = j + SIDE < columns ? j + SIDE : columns;
-#if defined(__AVX2__) && defined(__GNUC__)
-            if (i + SIDE <= rows && j + SIDE <= columns) {
-                turn_four(A + (size_t)i * across + j, across, B + (size_t)j * wide + i, wide);
-                continue;
-            }
-#endif
-            for (int c = j; c < end; ++c)
-                for (int r = i; r < last; ++r) B[(size_t)c * wide + r] = A[(size_t)r * across + c];
-        }
-}
-
 /* S <- half of A + A' (n x n), rows of A `across` apart; B: n x n to work in. */
 static void symmetric_part(const double *RESTRICT A, int across, int n, double *RESTRICT B, double *RESTRICT S) {
     turn(A, across, n, n, B, n);
     for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) S[i * n + j] = 0.5 * (A[(size_t)i * across + j] + B[i * n + j]);
+}
+
+/* The symmetric S (n x n) that solves the system a (n x 2n), which is made triangular as in `eliminate`. */
+static void eliminate_symmetric(
+    double *RESTRICT a, int n, double *RESTRICT swaps, double *RESTRICT tall, double *RESTRICT spare, double *RESTRICT S
+) {
+    const int w = 2 * n;
+    make_triangular(a, n, w, swaps, tall);
+    if (TALL == 2 || n < FEW_ROWS) {
+        solve_upper(a, n, w);
+        symmetric_part(a + n, w, n, spare, S);
+        return;
+    }
+    solve_blocks(a, n, w, 1);
+    turn(a + n, w, n, n, S, n);
+    for (int i = 0; i < n; ++i) memcpy(S + (size_t)i * n, a + (size_t)i * w + n, sizeof(double) * (i + 1));
 }
 
 /* A B, (rows x inner) (inner x columns). */
