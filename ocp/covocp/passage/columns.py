@@ -87,16 +87,32 @@ def numbers_in_turn(
     Raises:
         MemoryError: there was none.
     """
-    kept = _KEPT.setdefault(owner, _Kept())
-    told = kept.told(function)
-    if told is None or not told.plain or not all(shape.is_dense() or not shape.nnz() for shape in told.outputs):
+    told = _KEPT.setdefault(owner, _Kept()).told(function)
+    if told is None or not told.plain or not told.whole:
         return None
-    given = [np.asfortranarray(values, dtype=float) for values in (first, *columns)]
-    width = first.shape[1] * steps
-    found = [np.zeros((shape.shape[0], shape.shape[1] * width), order="F") for shape in told.outputs]
-    if told.run([array.ctypes.data for array in (*given, *found)], first.shape[1], steps):
-        raise MemoryError
-    return found
+    return told.of_numbers((first, *columns), first.shape[1], steps)
+
+
+def numbers_in_columns(owner: Owner, function: ca.Function, columns: Sequence[Array]) -> list[Array] | None:
+    """What `in_columns` gives of numbers, without a node.
+
+    Args:
+        owner: as of `in_columns`.
+        function: of dense arguments, one column each.
+        columns: of all of them.
+
+    Returns:
+        Columns of what the function gives; None where compiled code cannot take it or does not pay, or where something
+        is sparse.
+
+    Raises:
+        MemoryError: there was none.
+    """
+    kept = _KEPT.setdefault(owner, _Kept())
+    told = kept.told(function) if columns[0].shape[1] >= FEWEST or kept.knows(function) else None
+    if told is None or not told.whole:
+        return None
+    return told.of_numbers(columns, columns[0].shape[1])
 
 
 class _Kept:
@@ -105,6 +121,10 @@ class _Kept:
     def __init__(self) -> None:
         self.nodes: dict[tuple[ca.Function, int] | tuple[ca.Function, int, int], ca.Function] = {}
         self._told: dict[ca.Function, OnColumns | None] = {}
+
+    def knows(self, function: ca.Function) -> bool:
+        """Whether its operations were read."""
+        return function in self._told
 
     def told(self, function: ca.Function) -> OnColumns | None:
         """A function as the library is told of it; None without the library, or where operations are not known."""
@@ -164,6 +184,24 @@ class OnColumns:
         """Whether arguments and the first result are dense, and the first ones alike: what sequences are made of."""
         shapes = (*self.inputs, self.outputs[0])
         return all(shape.is_dense() for shape in shapes) and self.inputs[0].shape == self.outputs[0].shape
+
+    @property
+    def whole(self) -> bool:
+        """Whether what is given and found is dense, or nothing at all."""
+        return all(shape.is_dense() or not shape.nnz() for shape in (*self.inputs, *self.outputs))
+
+    def of_numbers(self, columns: Sequence[Array], count: int, steps: int = 1) -> list[Array]:
+        """What `run` makes of dense arguments, as new matrices of dense results.
+
+        Raises:
+            MemoryError: there was none.
+        """
+        given = [np.asfortranarray(values, dtype=float) for values in columns]
+        width = count * steps
+        found = [np.zeros((shape.shape[0], shape.shape[1] * width), order="F") for shape in self.outputs]
+        if self.run([array.ctypes.data for array in (*given, *found)], count, steps):
+            raise MemoryError
+        return found
 
     def run(self, addresses: Sequence[int | None], count: int, steps: int = 1) -> int:
         """Evaluate it on so many columns, or sequences of them.

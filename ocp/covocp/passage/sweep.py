@@ -121,6 +121,30 @@ def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Patter
     return result
 
 
+def from_one(first: Array, points: Sequence[Array], size: int, pattern: Pattern, every: int) -> Array:
+    """Half-vectors of a covariance from one start, as `passed_by` gives them of numbers, without a node.
+
+    Args:
+        first: half-vector at the start.
+        points: entries of h H of all steps at the first and at the second point, a column for each.
+        size: of the covariance.
+        pattern: rows and columns of the entries.
+        every: after how many steps, each time, one is wanted.
+
+    Returns:
+        A column for each of them.
+    """
+    count = points[0].shape[1]
+    sweep = _sweep(size, pattern, count, False, (), 0, True, every)
+    given = [np.asfortranarray(array, dtype=float) for array in (first, *points)]
+    result = np.empty((sweep.half, sweep.ends), order="F")
+    memory = _WORKSPACES.take(sweep)
+    places = [array.ctypes.data for array in given]
+    needed()["passage_forward"](memory, *places, None, None, result.ctypes.data)
+    _WORKSPACES.give(sweep, memory)
+    return result
+
+
 def entries_of(points: Sequence[Expr], size: int) -> Entries:
     """Entries of h H of steps, from the matrices (2n, 2n) of all steps side by side, at the first and second point."""
     rows, columns = _pattern(points, size)

@@ -19,6 +19,7 @@ from covocp.base.short_repr import short_repr
 from covocp.passage.sweep import values_by
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.numbers import segments_of_numbers
 from covocp.transcription.sequences import NUMERIC_RUN
 from covocp.transcription.shooting import compiled_steps, interval_columns, shoot
 from covocp.transcription.steering import compiled_along, nominal_states
@@ -113,12 +114,24 @@ class _Runs:
         """Run all segments: `_GIVEN` and `_AT_NODES` from `_STARTS`."""
         st, mesh = self._statement, self._mesh
         kept = not st.matrices or compiled_steps(mesh)  # a long sequence of CasADi's steps takes memory for all of it
+        found = self._of_numbers(*start)
+        if found is not None:
+            return found
         if not kept or not self._often("segments"):
             return [as_array(v) for v in self._shot([ca.DM(array) for array in start])]
         if self._made is None:
             symbols = [ca.MX.sym(name, *array.shape) for name, array in zip(_STARTS, start, strict=True)]
             self._made = Matrices(ca.Function("runs", symbols, self._shot(symbols)))
         return self._made.evaluated(*start)
+
+    def _of_numbers(self, x: Array, e: Array, u: Array, duration: Array, parameters: Array) -> list[Array] | None:
+        """The same by the compiled library alone, where it can."""
+        given = u, float(duration.item()), parameters[:, 0]
+        found = segments_of_numbers(self._statement, self._mesh, x, e[:, 0], given)
+        if found is None:
+            return None
+        none, at_nodes = np.zeros((0, found.gaps.shape[1])), (found.x, found.e)
+        return [found.gaps, none, found.costs[None], *(values[:, :: self._parts] for values in at_nodes)]
 
     def _shot(self, start: list[Any]) -> list[Any]:
         variables = SimpleNamespace(**dict(zip(_STARTS, start, strict=True)))

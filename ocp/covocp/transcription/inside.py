@@ -7,16 +7,18 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import Buffered, Matrices
+from covocp.base.buffered import Matrices
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
+from covocp.passage.columns import numbers_in_columns, numbers_in_turn
 from covocp.passage.sweep import from_many
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import KEPT, StepKind, fed, gauss_entries
+from covocp.transcription.covariance_steps import KEPT, StepKind, gauss_entries
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.numbers import by_themselves, columns_of_parts, turned
 from covocp.transcription.sequences import NUMERIC_ENTRIES, at_columns
-from covocp.transcription.shooting import compiled_steps, interval_columns
+from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import (
     full_interval,
     gathering_step,
@@ -47,60 +49,59 @@ def inside_intervals(
         RuntimeError: a step cannot be solved.
     """
     st, n = statement, mesh.intervals
-    common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
-    if not st.matrices or not _alone(st) or not compiled_steps(mesh):
+    if not st.matrices or not by_themselves(st, mesh):
+        common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
         function = Matrices(inside_interval(st, count, mesh.step).map(n))
         (inside,) = function.evaluated(nodes[:-1].T, nodes[1:].T, *common)
         return np.ascontiguousarray(inside.T).reshape(n, count + 1, nodes.shape[1])
     result = np.empty((n, count + 1, nodes.shape[1]))
     result[:, 0], result[:, -1] = nodes[:-1], nodes[1:]
-    result[:, 1:, : st.nx] = _states(st, mesh, nodes[:-1, : st.nx], common, count)
+    given = u.T, duration, parameters
+    columns = columns_of_parts(mesh, count, *given)
+    result[:, 1:, : st.nx] = _states(st, mesh, nodes[:-1, : st.nx], given, columns)
     most = max(NUMERIC_ENTRIES // (8 * st.ne * count), 1)  # H of all steps takes memory
     for first in range(0, n, most):
         span = slice(first, min(first + most, n))
-        _pass_matrices(st, mesh, result[span], common.columns(span))
+        own = slice(span.start * count, span.stop * count)
+        _pass_matrices(st, mesh, result[span], [column[:, own] for column in columns])
     return result
 
 
-def _alone(statement: Statement) -> bool:
-    """Whether all matrices pass along a nominal that is known, by steps of their own alone."""
-    everything = statement.ahead + statement.behind
-    plain = not statement.coupled and not statement.summed and statement.samples is None
-    return plain and not fed(statement, everything)
-
-
-def _states(statement: Statement, mesh: Mesh, starts: Array, common: Interval, count: int) -> Array:
+def _states(
+    statement: Statement, mesh: Mesh, starts: Array, given: tuple[Array, float, Array], columns: list[Array]
+) -> Array:
     """The nominal at the ends of the substeps, (N, count, nx), by the steps of the mesh where these divide them."""
-    n, own = mesh.intervals, mesh.substeps if count % mesh.substeps == 0 else count
-    advance, parts = Matrices(nominal_interval(statement, own, mesh.step).map(n)), count // own
-    values, x = [], starts.T
+    n, x = mesh.intervals, starts.T
+    count = columns[0].shape[1] // n
+    own = mesh.substeps if count % mesh.substeps == 0 else count
+    if mesh.step != "rodas":
+        found = numbers_in_turn(statement, nominal_interval(statement, 1, mesh.step), x, columns, count)
+        if found is not None:
+            return found[0].T.reshape(n, count, statement.nx)
+    advance, values = Matrices(nominal_interval(statement, own, mesh.step).map(n)), []
+    common, parts = interval_columns(mesh, *(ca.DM(value) for value in given)), count // own
     for j in range(parts):
         x, fine, _ = advance.evaluated(x, *common.part(j / parts, (j + 1) / parts))
         values.append(fine.T.reshape(n, own, statement.nx))
     return np.concatenate(values, axis=1)
 
 
-def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Interval) -> None:
+def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, columns: list[Array]) -> None:
     """Write the matrices inside some intervals beside the states, (N, count + 1, nx + ne), by the compiled passage."""
     st, (n, points, _), nx = statement, values.shape, statement.nx
     count = points - 1
-    states = [values[:, at, :nx].reshape(n * count, nx) for at in (slice(count), slice(1, None))]
+    steps = [values[:, at, :nx].reshape(n * count, nx).T for at in (slice(count), slice(1, None))] + columns
     order = np.arange(n * count).reshape(n, count)[:, ::-1].ravel()
     for positions, backward in ((st.ahead, False), (st.behind, True)):
-        if not positions:
-            continue
-        ends, steps = states, common.substeps(count)
-        if backward:
-            ends, steps = [state[order] for state in states[::-1]], steps.columns(order.tolist()).turned()
-        rows = [end.ravel() for end in ends] + [np.asarray(ca.DM(v).full()).ravel(order="F") for v in steps]
+        along = turned(steps, order) if backward and positions else steps
         for i in positions:
             block = st.matrices[i]
             own = slice(nx + block.span.start, nx + block.span.stop)
             function, pattern = gauss_entries(st, i, mesh.step)
-            h = Buffered(at_columns(st, mesh, function, n * count))(*rows)
+            h = numbers_in_columns(st, function, along)
             if h is None:
-                raise RuntimeError(f"{function.name()} failed")
-            after = from_many(values[:, -1 if backward else 0, own], h, block.size, pattern, count)
+                h = Matrices(at_columns(st, mesh, function, n * count)).evaluated(*along)
+            after = from_many(values[:, -1 if backward else 0, own], [v.T for v in h], block.size, pattern, count)
             if backward:
                 values[:, :-1, own] = after[:, ::-1]
             else:

@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr, beside, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
@@ -298,11 +299,7 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
 def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:
     """Running cost of each interval where it depends on the matrices; of a closed loop by parts but near the end."""
     n, m = mesh.intervals, mesh.substeps
-    parted = np.zeros(n, dtype=bool)
-    if statement.behind:
-        parted = (
-            np.asarray(taken_by_parts(statement, ca.DM(mesh.nodes[:-1]), ca.DM(np.diff(mesh.nodes))).full()).ravel() > 0
-        )
+    parted = parted_intervals(statement, mesh)
     widths = (1, 1, m, m) + (1,) * (len(columns) - 4)
     order, costs = [], []
     for by_parts in (True, False):
@@ -314,6 +311,14 @@ def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> 
             order += span.tolist()
     found: Any = ca.horzcat(*costs)
     return found if order == list(range(n)) else found[:, np.argsort(order).tolist()]
+
+
+def parted_intervals(statement: Statement, mesh: Mesh) -> NDArray[np.bool_]:
+    """Whether the cost of a closed loop is taken by parts, of each interval."""
+    if not statement.behind:
+        return np.zeros(mesh.intervals, dtype=bool)
+    taken = taken_by_parts(statement, ca.DM(mesh.nodes[:-1]), ca.DM(np.diff(mesh.nodes)))
+    return np.asarray(taken.full()).ravel() > 0
 
 
 def _of(kicks: Expr, statement: Statement, positions: tuple[int, ...]) -> Any:

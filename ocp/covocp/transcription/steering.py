@@ -18,7 +18,8 @@ from covocp.passage.columns import numbers_in_turn
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh, control_places
-from covocp.transcription.shooting import control_ends, interval_columns
+from covocp.transcription.numbers import columns_of_parts
+from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import nominal_interval
 
 STEERING_STEPS = 4
@@ -133,41 +134,12 @@ def compiled_along(
     """
     parts = mesh.substeps if mesh.step != "rodas" else 1  # step by step: one function for all numbers of substeps
     advance = nominal_interval(statement, mesh.substeps // parts, mesh.step)
-    columns = _columns_of_parts(mesh, parts, u.T, duration, parameters)
+    columns = columns_of_parts(mesh, parts, u.T, duration, parameters)
     found = numbers_in_turn(statement, advance, start[:, None], columns, mesh.intervals * parts)
     if found is None:
         return None
     costs = np.cumsum(found[2].reshape(-1, parts), axis=1)[:, -1]
     return found[0][:, parts - 1 :: parts], float(np.cumsum(costs)[-1])
-
-
-def _columns_of_parts(mesh: Mesh, parts: int, u: Array, duration: float, parameters: Array) -> list[Array]:
-    """What `Interval` has, of the parts of all intervals, numbers in a column each."""
-    n, (begin, end) = mesh.intervals * parts, control_ends(mesh, u)
-    if parts > 1:
-        own, places = (begin, end), [j / parts for j in range(parts + 1)]
-        controls = [own[int(c)] if c in (0.0, 1.0) else begin + c * (end - begin) for c in places]
-        begin, end = _beside(controls[:-1]), _beside(controls[1:])
-    s, ds, reading = _parts_of(mesh, parts)
-    return [begin, end, s, ds, np.full((1, n), duration), np.tile(parameters[:, None], (1, n)), reading]
-
-
-@lru_cache(maxsize=KEPT)
-def _parts_of(mesh: Mesh, parts: int) -> tuple[Array, Array, Array]:
-    """Starts and lengths of the parts of all intervals, and what they read, a column each."""
-    s, ds = mesh.nodes[None, :-1], np.diff(mesh.nodes)[None]
-    reading = mesh.readings if mesh.readings.size else np.zeros((0, mesh.intervals))
-    places = [(j / parts, (j + 1) / parts) for j in range(parts)]
-    return (
-        _beside([s + c * ds for c, _ in places]),
-        _beside([(d - c) * ds for c, d in places]),
-        _beside([(d - c) * reading for c, d in places]),
-    )
-
-
-def _beside(each: list[Array]) -> Array:
-    """Columns of the first, second, ... part of each interval, in their order."""
-    return np.stack(each, axis=2).reshape(each[0].shape[0], each[0].shape[1] * len(each))
 
 
 def _numbers_along(
