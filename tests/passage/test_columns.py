@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import weakref
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -116,16 +117,42 @@ def test_a_text_that_is_not_understood_is_not_believed(monkeypatch: pytest.Monke
     """Where CasADi kept functions otherwise, or a number is off, operations are asked for one by one."""
     function = gauss_points(mass_chain.problem(5).statement(), 0, "gauss")
     expected = operations.asked_one_by_one(function)
-    whole = operations._listed
-
-    def shifted(records: np.ndarray):
-        return whole(records[:, [0, 1, 3, 2]])
-
-    for wrong in (shifted, lambda records: None):
-        monkeypatch.setattr(operations, "_listed", wrong)
+    exchanged = operations._TABLE.copy()
+    exchanged[[ca.OP_MUL, ca.OP_ADD]] = exchanged[[ca.OP_ADD, ca.OP_MUL]]
+    shorter = operations._TABLE.copy()
+    shorter[ca.OP_MUL] = operations.UNKNOWN
+    for table in (exchanged, shorter):
+        monkeypatch.setattr(operations, "_TABLE", table)
         assert operations.read_at_once(function) is None
-        for one, other in zip(operations.program(function), expected, strict=True):
-            np.testing.assert_array_equal(one, other)
+    for one, other in zip(operations.asked_one_by_one(function), expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("change", ["letters", "half", "none"])
+def test_a_text_of_another_kind_is_none(monkeypatch: pytest.MonkeyPatch, change: str):
+    """Other letters, the half of it, nothing at all."""
+    function = gauss_points(mass_chain.problem(5).statement(), 0, "gauss")
+    whole = library.needed()["operations"]
+
+    def changed(text: bytes, length: int, *others: Any) -> int:
+        other = {"letters": text.replace(b"c", b"z"), "half": text[: length // 2], "none": b""}[change]
+        return whole(other, len(other), *others)
+
+    assert operations.read_at_once(function) is not None
+    monkeypatch.setattr(operations, "functions", lambda: {"operations": changed})
+    assert operations.read_at_once(function) is None
+    assert operations.program(function) is not None
+
+
+def test_a_function_of_which_a_copy_is_in_its_text_is_told_from_it():
+    """CasADi writes what a derivative is one of beside it, which begins like it."""
+    own = smooth()
+    for function in (own.reverse(1), own.forward(1), own.reverse(1).forward(1)):
+        rows, constants = operations.asked_one_by_one(function)
+        read = operations.read_at_once(function)
+        assert read is not None
+        np.testing.assert_array_equal(read[0], rows)
+        np.testing.assert_array_equal(read[1], constants)
 
 
 @pytest.mark.parametrize("which", ["gradient", "tangent", "product", "jacobian"])

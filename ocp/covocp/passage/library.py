@@ -13,7 +13,7 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 13
+VERSION = 14
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -29,6 +29,14 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "exported_slopes": (None, (_ADDRESS,) * 7),
     "transitions": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 5),
     "columns": (_WHOLE, (_WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE)),
+    "operations": (
+        ctypes.c_longlong,
+        (ctypes.c_char_p, ctypes.c_size_t, ctypes.c_longlong, _WHOLE, _ADDRESS)
+        + (_WHOLE,) * 4
+        + (_ADDRESS,) * 2
+        + (_WHOLE,)
+        + (_ADDRESS,) * 3,
+    ),
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.matrices import Array, distinct
+from covocp.passage.library import functions
 
 # CasADi's operations in the order of those in columns.h.
 KINDS = (
@@ -26,7 +27,7 @@ _PAIRS = frozenset(
     {"ADD", "SUB", "MUL", "DIV", "POW", "LT", "LE", "EQ", "NE", "AND", "OR", "FMOD", "COPYSIGN", "IF_ELSE_ZERO"}
     | {"FMIN", "FMAX", "ATAN2", "HYPOT", "INPUT", "OUTPUT"}
 )
-OF_TWO = np.array([name in _PAIRS for name in KINDS])
+OF_TWO = np.array([name in _PAIRS for name in KINDS], np.intc)
 
 # Of each operation its kind and three numbers, as in columns.h, and its constant.
 Program = tuple[NDArray[np.intc], Array]
@@ -34,14 +35,15 @@ Program = tuple[NDArray[np.intc], Array]
 # What CasADi's numbers of operations become.
 _TABLE = np.full(256, UNKNOWN, np.intc)
 _TABLE[list(NUMBERS)] = list(NUMBERS.values())
-# Operations that are compared with what CasADi tells of each, of those read at once; from so many on it pays.
-COMPARED, MANY = 8, 120
+# Operations that are compared with what CasADi tells of each, of those read at once; from so many on it pays; of the
+# first so many one must be an input.
+COMPARED, MANY, LOOKED_AT = 8, 60, 200
 
 
 def program(function: ca.Function) -> Program | None:
     """The operations of a function of scalars.
 
-    To ask CasADi for one after the other takes four times as long as to read all of them at once.
+    To ask CasADi for one after the other takes six times as long as to read all of them at once.
 
     Args:
         function: any of CasADi's.
@@ -74,74 +76,37 @@ def asked_one_by_one(function: ca.Function, places: range | list[int] | None = N
 
 
 def read_at_once(function: ca.Function) -> Program | None:
-    """The same from the text in which CasADi keeps a function; None where it is not found there as it is known.
+    """The same from the text in which CasADi keeps a function, by the library; None where it is not found there.
 
-    There each operation is four whole numbers: its kind, its register, and what it is made of, or its constant; of an
-    input the register, the argument and the place there; of an output the result, the register and the place there.
-    That is no promise of CasADi's: what is found is compared with what it tells of some of them (`_agrees`).
+    How CasADi writes it is no promise of CasADi's (listing.h): what is found is compared with what it tells of some.
     """
-    count = function.n_instructions()
-    first = asked_one_by_one(function, range(min(count, COMPARED)))
-    given = () if first is None else np.flatnonzero(first[0][:, 0] == INPUT).tolist()
-    if first is None or not given:
+    library, count = functions(), function.n_instructions()
+    first = range(min(count, LOOKED_AT))
+    place = next((k for k in first if function.instruction_id(k) == ca.OP_INPUT), None)
+    if library is None or place is None:
         return None
-    digits = np.frombuffer(function.serialize().encode(), np.uint8) - ord("a")
-    if digits.size % 2 or digits.max(initial=0) > 15:
-        return None
-    content = (digits[0::2] | digits[1::2] << 4).tobytes()
-    place = given[0]
-    _, argument, inside, register = first[0][place].tolist()
-    record = np.array([int(ca.OP_INPUT), register, argument, inside], "<i4").tobytes()
-    places = distinct(np.linspace(0, count - 1, COMPARED).astype(int)).tolist()
-    found = content.find(record)
-    while found >= 0:
-        start = found - 16 * place
-        if start >= 0 and len(content) >= start + 16 * count:
-            listed = _listed(np.frombuffer(content, "<i4", 4 * count, start).reshape(count, 4))
-            if listed is not None and _agrees(listed, function, places):
-                return listed
-        found = content.find(record, found + 1)
+    (register,) = function.instruction_output(place)
+    known = np.array([ca.OP_INPUT, register, *function.instruction_input(place)], np.intc)
+    sizes = function.n_in(), function.n_out()
+    heights = [*map(function.nnz_in, range(sizes[0])), *map(function.nnz_out, range(sizes[1]))]
+    own, rows, constants = np.array(heights, np.intc), np.empty((count, 4), np.intc), np.empty(count)
+    given = (place, known.ctypes.data, count, max(function.sz_w(), 1), *sizes, own.ctypes.data)
+    tables = _TABLE.ctypes.data, _TABLE.size, OF_TWO.ctypes.data
+    text, found = function.serialize().encode(), -1
+    while (found := library["operations"](text, len(text), found + 1, *given, *tables, *_places(rows, constants))) >= 0:
+        if _agrees(rows, constants, function):
+            return rows, constants
     return None
 
 
-def _listed(records: NDArray[np.int32]) -> Program | None:
-    """What four whole numbers of each operation tell."""
-    given = records[:, 0]
-    if ((given < 0) | (given >= _TABLE.size)).any():
-        return None
-    kinds = _TABLE[given]
-    if (kinds == UNKNOWN).any():
-        return None
-    rows = np.column_stack([kinds, records[:, 2], records[:, 3], records[:, 1]])
-    outputs, constants = kinds == OUTPUT, kinds == CONSTANT
-    rows[outputs, 1:] = records[outputs][:, [2, 1, 3]]
-    rows[~OF_TWO[kinds], 2] = 0
-    rows[constants, 1] = 0
-    values = np.zeros(kinds.size)
-    values[constants] = np.ascontiguousarray(records[constants, 2:]).view("<f8").ravel()
-    return np.ascontiguousarray(rows, np.intc), values
+def _places(rows: NDArray[np.intc], constants: Array) -> tuple[int, int]:
+    """Where they lie."""
+    return rows.ctypes.data, constants.ctypes.data
 
 
-def _agrees(listed: Program, function: ca.Function, places: list[int]) -> bool:
-    """Whether all numbers are in their ranges, and some of the operations those that CasADi tells of.
-
-    Those of some places, and the constants.
-    """
-    rows, values = listed
-    kinds, registers = rows[:, 0], function.sz_w()
-    inputs, outputs = kinds == INPUT, kinds == OUTPUT
-    for chosen, columns in ((inputs, (3,)), (outputs, (1,)), (~(inputs | outputs), (1, 2, 3))):
-        numbers = rows[chosen][:, columns]
-        if ((numbers < 0) | (numbers >= registers)).any():
-            return False
-    heights = (
-        [function.nnz_in(i) for i in range(function.n_in())],
-        [function.nnz_out(i) for i in range(function.n_out())],
-    )
-    for chosen, (which, place), known in ((inputs, (1, 2), heights[0]), (outputs, (2, 3), heights[1])):
-        whole, inside = rows[chosen, which], rows[chosen, place]
-        if ((whole < 0) | (whole >= len(known))).any() or ((inside < 0) | (inside >= np.array(known)[whole])).any():
-            return False
-    places = [*places, *np.flatnonzero(kinds == CONSTANT)[:COMPARED].tolist()]
+def _agrees(rows: NDArray[np.intc], constants: Array, function: ca.Function) -> bool:
+    """Whether the operations at some places, and some constants, are those that CasADi tells of."""
+    places = distinct(np.linspace(0, len(rows) - 1, COMPARED).astype(int)).tolist()
+    places += np.flatnonzero(rows[:, 0] == CONSTANT)[:COMPARED].tolist()
     told = asked_one_by_one(function, places)
-    return told is not None and np.array_equal(told[0], rows[places]) and np.array_equal(told[1], values[places])
+    return told is not None and np.array_equal(told[0], rows[places]) and np.array_equal(told[1], constants[places])

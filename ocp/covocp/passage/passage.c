@@ -12,9 +12,10 @@
 #include "calls.h"
 #include "places.h"
 #include "written.h"
+#include "listing.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 13; }
+EXPORT int passage_version(void) { return 14; }
 
 /* Whether this processor can take the functions whose names end in _newer. */
 EXPORT int passage_newer(void) {

@@ -133,9 +133,7 @@ def by_themselves(statement: Statement, mesh: Mesh) -> bool:
     return plain and not fed(st, st.ahead + st.behind)
 
 
-def _nominal(
-    statement: Statement, mesh: Mesh, starts: Array, columns: Sequence[Array]
-) -> tuple[Array, Array] | None:
+def _nominal(statement: Statement, mesh: Mesh, starts: Array, columns: Sequence[Array]) -> tuple[Array, Array] | None:
     """States after all substeps, of segments from their starts, and the running cost of each interval."""
     m = mesh.substeps
     if mesh.step == "rodas" and m > 1:
@@ -164,9 +162,7 @@ def _last(statement: Statement, x: Array, duration: float, parameters: Array) ->
     return result
 
 
-def _matrices(
-    statement: Statement, mesh: Mesh, e0: Array, last: Array, steps: list[Array], every: int
-) -> Array | None:
+def _matrices(statement: Statement, mesh: Mesh, e0: Array, last: Array, steps: list[Array], every: int) -> Array | None:
     """Half-vectors at the start and after every so many substeps, each time.
 
     Of `steps`: states before and after each substep and what `Interval` has, a column each.

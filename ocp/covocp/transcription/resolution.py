@@ -9,6 +9,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import gauss_transition
+from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.trajectory import Trajectory
 
@@ -38,10 +39,10 @@ def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> A
     forms = [f for b, f in zip(statement.matrices, statement.riccati, strict=True) if b.estimation and f is not None]
     if not forms or statement.coupled or not np.isfinite(along.x).all():
         return result
-    count, points = PLACES + 1, [_point(along, place) for place in range(PLACES + 1)]
-    columns = [np.column_stack([np.atleast_1d(point[i]) for point in points]) for i in range(4)]
-    fixed = np.tile(parameters[:, None], (1, count))
-    drifts, _, informations = (stacked(v, count) for v in forms[0].map(count)(*columns, fixed))
+    count = PLACES + 1
+    x, u, times, duration = _points(along, np.arange(count))
+    rest = repeated(duration, parameters, count)
+    drifts, _, informations = (stacked(v, count) for v in forms[0].map(count)(x.T, u.T, times[None], *rest))
     drift = drifts[0]
     if not np.isfinite(drift).all():
         return result
@@ -55,7 +56,7 @@ def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> A
         for place, rows, variance in _read(statement, along, parameters):
             read = rows @ moved[place]
             seen += np.sum(read * np.linalg.solve(variance, read), axis=0)
-        reached = _reached(statement, points[0], parameters, np.array(moved) * along.duration / PLACES)
+        reached = _reached(statement, _points(along, 0), parameters, np.array(moved) * along.duration / PLACES)
         for k, row in estimated_rows(statement).items():
             resolved = seen[row] ** -0.5 if seen[row] > 0 else np.inf
             result[k] = resolved if resolved <= reached[row] else np.inf
@@ -93,12 +94,12 @@ def _read(statement: Statement, along: Trajectory, parameters: Array) -> Iterato
     for block, instants in zip(samples.blocks, samples.places, strict=True):
         for instant in instants:
             place = round(instant * PLACES)
-            _, jacobian, variance = (v.full() for v in samples.measurement(*_point(along, place), parameters))
+            _, jacobian, variance = (v.full() for v in samples.measurement(*_points(along, place), parameters))
             yield place, jacobian[block.span], variance[block.span, block.span]
 
 
-def _point(along: Trajectory, place: int) -> tuple[Array, Array, float, float]:
-    """State, control, time and duration near one of the places of a trajectory."""
-    share = place / PLACES
-    x, u = (values[round(share * (values.shape[0] - 1))] for values in (along.x, along.u))
-    return x, u, share * along.duration, along.duration
+def _points(along: Trajectory, places: Any) -> tuple[Any, Any, Any, float]:
+    """States, controls, times and the duration near one of the places of a trajectory, or some of them."""
+    shares = places / PLACES
+    x, u = (values[np.rint(shares * (values.shape[0] - 1)).astype(int)] for values in (along.x, along.u))
+    return x, u, shares * along.duration, along.duration
