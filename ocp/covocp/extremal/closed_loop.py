@@ -26,6 +26,7 @@ from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, as_array, pack_symbolic, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
+from covocp.extremal.dense_output import mapped
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
 from covocp.extremal.joint import Statistics, joint_covariances, loop_of
@@ -141,6 +142,7 @@ def covariances_along(extremal: Extremal, fine: Array, start: Array | None = Non
     return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
 
 
+@lru_cache(maxsize=4)
 def loop_substeps(extremal: Extremal) -> int:
     """Even number of steps an interval that resolves filter and feedback: S falls fast before a weighted end."""
     st, count = extremal.statement, extremal.mesh.intervals + 1
@@ -256,19 +258,12 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
     best = bool(st.behind) and design
-    function = _running(st)
-    h, x, u, time, duration = np.diff(extremal.time), *_points(extremal, fine)
-    p = np.tile(extremal.parameters[:, None], (1, n))
-    running = deviations = other = nonlinear = 0.0
-    for j in range(m + 1):
-        weight = simpson_weight(j, m) * h
-        covariance = joint[j::m][:n].transpose(1, 0, 2).reshape(2 * size, -1)
-        at = (x[:, j].T, u[:, j].T, fine[:, j, st.nx :].T, time[:, j].T, duration[:, j].T, p)
-        L, fed, alternative, added = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))
-        running += float(weight @ L)
-        deviations += float(weight @ fed)
-        other += float(weight @ alternative)
-        nonlinear += float(weight @ added)
+    x, u, time, duration = (values.reshape(n * (m + 1), -1).T for values in _points(extremal, fine))
+    halves, p = fine.reshape(n * (m + 1), -1)[:, st.nx :].T, np.tile(extremal.parameters[:, None], (1, n * (m + 1)))
+    covariance = joint[(m * np.arange(n)[:, None] + np.arange(m + 1)).ravel()].reshape(n * (m + 1), -1).T
+    weights = np.diff(extremal.time)[:, None] * [simpson_weight(j, m) for j in range(m + 1)]
+    along = mapped(_running(st), x, u, halves, time, duration, p, covariance, owner=st)
+    running, deviations, other, nonlinear = (float(weights.ravel() @ values[0]) for values in along)
     loop = loop_of(st)
     k, S = (np.asarray(v.full()) for v in loop.terminal(t.x[-1], t.duration, extremal.parameters))
     error, cross, estimate = joint[-1][:size, :size], joint[-1][:size, size:], joint[-1][size:, size:]

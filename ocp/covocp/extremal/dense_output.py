@@ -25,9 +25,10 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
 from covocp.extremal.polynomials import Dense, joined, lengths, rows_of, semidefinite
+from covocp.passage.columns import Owner, numbers_in_columns
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.numbers import compiled_step
 from covocp.transcription.scales import magnitudes
 from covocp.transcription.steps import joint_interval, matrices_step, nominal_interval
 
@@ -191,10 +192,15 @@ class _Steps:
         nothing = np.zeros((self.extremal.statement.readings, c.size))
         common = (*ends, *self.fixed(c.size), nothing)
         st, mesh = self.extremal.statement, self.extremal.mesh
-        function = _advance(st, mesh.step, mesh.linear_solver, tuple(self.rows), self.states is not None)
         if self.states is None:
-            return mapped(function, z.T, *common)[0].T
-        return mapped(function, z.T, self.states.at(s).T, self.states.at(after).T, *common)[0].T
+            function = joint_interval(st, 1) if st.coupled else nominal_interval(st, 1, mesh.step)
+            return mapped(function, z.T, *common, owner=st)[0].T
+        columns = [self.states.at(s).T, self.states.at(after).T, *common]
+        positions = st.behind if self.backward else st.ahead
+        passed = compiled_step(st, mesh, positions, z, columns)
+        if passed is not None:
+            return passed
+        return mapped(matrices_step(st, positions, mesh.step, mesh.linear_solver), z.T, *columns)[0].T
 
     def slope(self, k: Expr, c: Array, h: Array, z: Array) -> Array:
         """Slopes by the share at c, as their limit from the side of a step h from there."""
@@ -206,10 +212,10 @@ class _Steps:
         full[:, self.rows] = z
         time = duration * self.place(k, c + one_sided(0.0) * h)
         if st.nominal is not None and self.states is None:
-            rates = mapped(st.nominal, full[:, :nx].T, self.control(k, c).T, time, duration, parameters)[0].T
+            rates = mapped(st.nominal, full[:, :nx].T, self.control(k, c).T, time, duration, parameters, owner=st)[0].T
         else:
             arguments = (full[:, :nx].T, self.control(k, c).T, full[:, nx:].T, time, duration, parameters)
-            rates = np.vstack(mapped(st.rates, *arguments)[:2]).T
+            rates = np.vstack(mapped(st.rates, *arguments, owner=st)[:2]).T
         length = np.diff(self.extremal.mesh.nodes)[k] * self.extremal.trajectory.duration
         return np.asarray((-length if self.backward else length)[:, None] * rates[:, self.rows])
 
@@ -250,27 +256,20 @@ def _variances(statement: Statement, rows: list[int]) -> Any:
     return result
 
 
-@lru_cache(maxsize=KEPT)
-def _advance(statement: Statement, step: Expr, solver: str, rows: tuple[int, ...], matrices: bool) -> ca.Function:
-    """One step of the integrator: (values, [x at both ends,] *common) -> values."""
-    if matrices:
-        positions = (
-            statement.ahead if rows[0] - statement.nx in statement.entries(statement.ahead) else statement.behind
-        )
-        return matrices_step(statement, positions, step, solver)
-    return joint_interval(statement, 1) if statement.coupled else nominal_interval(statement, 1, step)
-
-
-def mapped(function: ca.Function, *columns: Array) -> list[Array]:
+def mapped(function: ca.Function, *columns: Array, owner: Owner | None = None) -> list[Array]:
     """A function of columns, for many of them; evaluated in chunks, so that no graph grows with their number.
 
     Args:
         function: of columns, to columns.
         columns: of its arguments, (entries, count) each.
+        owner: as of `in_columns`, of a function that is asked for often: the compiled library takes it where it can.
 
     Returns:
         Its outputs, (entries, count) each.
     """
+    found = None if owner is None else numbers_in_columns(owner, function, columns)
+    if found is not None:
+        return found
     count, begin, parts = columns[0].shape[1], 0, []
     while begin < count:
         chunk = next((size for size in CHUNKS if size >= count - begin), CHUNKS[-1])

@@ -13,21 +13,24 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import swept
+from covocp.base.buffered import Matrices, swept
 from covocp.base.dataclass import dataclass
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, as_array, pack, stacked, unpack, unpack_symbolic
+from covocp.base.matrices import Array, pack, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.readings import Readings, readings_along
+from covocp.passage.columns import numbers_in_columns
 from covocp.passage.library import functions
-from covocp.passage.sweep import entries_of, passed_by
+from covocp.passage.shape import Pattern
+from covocp.passage.sweep import from_one
 from covocp.statement.interval import Interval, one_sided, repeated
 from covocp.statement.statement import Loop, Statement
-from covocp.transcription.covariance_steps import KEPT, moving_step
+from covocp.transcription.covariance_steps import KEPT, entries_of_points, moving_step
+from covocp.transcription.numbers import columns_of_parts
 
 # Time constants of the filter within an interval from which on it is too fast for equal parts, where it then slows down
 # by the second factor: what it does at the start is over before the first part ends.
@@ -121,22 +124,21 @@ class _Course:
 
     def by_equal_parts(self, begin: int, end: int, first: Array) -> Array:
         """At the ends of all parts of the intervals from `begin` to `end`."""
-        m = self.fine.shape[1] - 1
+        m, t = self.fine.shape[1] - 1, self.extremal.trajectory
         chosen, size = slice(begin * m, end * m), first.shape[0]
-        common = tuple(np.asarray(ca.DM(c))[:, chosen] for c in self.extremal.intervals.substeps(m))
+        common = columns_of_parts(self.extremal.mesh, m, t.u.T, t.duration, self.extremal.parameters)
         course = self.fine[begin:end]
         before, after = (part.reshape((end - begin) * m, -1).T for part in (course[:, :-1], course[:, 1:]))
-        points = self._points((before, after, *common))
+        columns = (before, after, *(column[:, chosen] for column in common))
         jumps = {
             entry.interval: _jump(self.extremal, entry, self.statistics)
             for entry in readings_along(self.extremal)
             if begin <= entry.interval < end
         }
         if functions() is not None and not jumps:
-            passed = passed_by(ca.DM(pack(first)), entries_of(points, size))
-            return np.asarray(unpack(as_array(ca.DM(passed)).T, size))
+            return unpack(self._passed(pack(first), columns, size).T, size)
         values = [first]
-        for k, D in enumerate(_transitions(points, size), begin * m):
+        for k, D in enumerate(_transitions(self._points(columns), size), begin * m):
             value = lyapunov_after(D, values[-1])
             if k % m == m - 1 and k // m in jumps:
                 transition, noise = jumps[k // m]
@@ -165,12 +167,23 @@ class _Course:
 
     def _points(self, columns: tuple[Array, ...]) -> list[Any]:
         """h H at both Gauss points of parts whose columns these are."""
-        count = columns[0].shape[1]
-        q = np.tile(self.statistics.parameters[:, None], (1, count))
-        points: list[Any] = (
-            _joint_points(self.extremal.statement, self.statistics.density).map(count).call([*columns, q])
-        )
+        function = _joint_points(self.extremal.statement, self.statistics.density)
+        points: list[Any] = function.map(columns[0].shape[1]).call([*columns, self._true(columns)])
         return points
+
+    def _true(self, columns: tuple[Array, ...]) -> Array:
+        """Parameters of the truth, a column each."""
+        return np.tile(self.statistics.parameters[:, None], (1, columns[0].shape[1]))
+
+    def _passed(self, first: Array, columns: tuple[Array, ...], size: int) -> Array:
+        """Half-vectors after each of some parts, a column each, by the compiled passage."""
+        st = self.extremal.statement
+        function, pattern = _joint_entries(st, self.statistics.density)
+        given = (*columns, self._true(columns))
+        points = numbers_in_columns(st, function, given)
+        if points is None:
+            points = Matrices(function.map(given[0].shape[1])).evaluated(*given)
+        return from_one(first, points, size, pattern, 1)
 
     def _between(self, k: int, c: Array) -> Array:
         """x and the half-vectors at shares of interval k: x cubic, the others linear between its equal parts."""
@@ -257,6 +270,12 @@ def _joint_points(statement: Statement, density: ca.Function) -> ca.Function:
         driven = ca.blockcat([[spread + noise, spread], [spread, spread]])
         points.append(h * ca.blockcat([[-drift.T, symbolic(2 * size, 2 * size)], [driven, drift]]))
     return ca.Function("joint_points", [za, zb, *common, q], points)
+
+
+@lru_cache(maxsize=KEPT)
+def _joint_entries(statement: Statement, density: ca.Function) -> tuple[ca.Function, Pattern]:
+    """The same by what may be nonzero; rows and columns of it."""
+    return entries_of_points(_joint_points(statement, density))
 
 
 def filter_of(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:

@@ -88,13 +88,18 @@ def gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Functio
 @lru_cache(maxsize=KEPT)
 def gauss_entries(statement: Statement, index: int, step: StepKind) -> tuple[ca.Function, Pattern]:
     """`gauss_points` by what of h H may be nonzero at one of the points, a column for each; rows and columns of it."""
-    function = gauss_points(statement, index, step)
+    return entries_of_points(gauss_points(statement, index, step), slopes_wanted(statement, 2))
+
+
+def entries_of_points(function: ca.Function, options: dict[str, Any] | None = None) -> tuple[ca.Function, Pattern]:
+    """A function to h H at two points by what may be nonzero at one of them: a column each, and rows and columns."""
     symbols: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     pattern = function.sparsity_out(0) + function.sparsity_out(1)
     column = ca.Sparsity.dense(pattern.nnz(), 1)
     points = [ca.sparsity_cast(ca.project(point, pattern), column) for point in function.call(symbols)]
     rows, columns = pattern.get_triplet()
-    return ca.Function("gauss_entries", symbols, points, slopes_wanted(statement, 2)), (tuple(rows), tuple(columns))
+    own = ca.Function("gauss_entries", symbols, points, options or {})
+    return own, (tuple(rows), tuple(columns))
 
 
 def _hermite_points(statement: Statement, xa: Expr, xb: Expr, interval: Interval) -> Expr:

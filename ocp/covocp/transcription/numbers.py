@@ -11,13 +11,13 @@ import numpy as np
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array
 from covocp.passage.columns import numbers_in_columns, numbers_in_turn
-from covocp.passage.sweep import from_one
+from covocp.passage.sweep import from_many, from_one
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, fed, gauss_entries
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import NUMERIC_ENTRIES
 from covocp.transcription.shooting import compiled_steps, control_ends, parted_intervals
-from covocp.transcription.steps import nominal_interval, simpson_interval
+from covocp.transcription.steps import nominal_interval, read_by, simpson_interval
 
 
 class Segments(NamedTuple):
@@ -94,6 +94,34 @@ def matrix_costs(statement: Statement, mesh: Mesh, columns: tuple[Array, ...]) -
         if found is None:
             found = Matrices(function.map(span.size)).evaluated(*given)
         result[span] = found[0][0]
+    return result
+
+
+def compiled_step(
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], halves: Array, columns: Sequence[Array]
+) -> Array | None:
+    """Some matrices over one step each, along a nominal that is known at both ends of it: many steps at once.
+
+    Args:
+        statement: the problem.
+        mesh: whose steps they are.
+        positions: of the matrices, all those that run in one direction.
+        halves: their half-vectors before each step, (steps, entries).
+        columns: states before and after each step and what `Interval` has, of which nothing is read.
+
+    Returns:
+        The half-vectors after it; None where the steps are others than compiled ones, or do not pay.
+    """
+    if not compiled_steps(mesh) or fed(statement, positions) or read_by(statement, positions):
+        return None
+    result, begin = np.empty_like(halves), 0
+    for i in positions:
+        block, (function, pattern) = statement.matrices[i], gauss_entries(statement, i, mesh.step)
+        points = numbers_in_columns(statement, function, columns)
+        if points is None:
+            return None
+        own, begin = slice(begin, begin + block.length), begin + block.length
+        result[:, own] = from_many(halves[:, own], [v.T for v in points], block.size, pattern, 1)[:, 0]
     return result
 
 
