@@ -26,12 +26,28 @@ from covocp.transcription.stiffness import resolve_mesh
 
 pytestmark = pytest.mark.skipif(functions() is None, reason=str(build_info()["library"]))
 
+
+def two_forward() -> co.Problem:
+    """A filter, and beside it a Lyapunov equation of other size along the same nominal."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", 2, initial=[1.0, 0.0], variance=[0.1, 0.2]), ocp.control("u", lower=-1.0, upper=1.0)
+    b = ocp.unknown("b", mean=1.0, variance=0.3)
+    ocp.dynamics(x, ca.vertcat(x[1], -b * ca.sin(x[0]) + u), noise=[0.01, 0.02])
+    ocp.measurement("y", x[0], noise=0.1)
+    P, E = ocp.symmetric("P", 2, initial=np.diag([0.2, 0.1])), ocp.estimation_covariance()
+    F = ca.blockcat([[0.0, 1.0], [-ca.cos(x[0]), -0.3]])
+    ocp.dynamics(P, F @ P + P @ F.T + 0.1 * np.eye(2))
+    ocp.minimize(running=u**2, terminal=E[b, b] + P[0, 0])
+    return ocp
+
+
 CASES: dict[str, tuple[Any, dict[str, Any]]] = {
     "one sensor": (unknown_lag.problem, {}),
     "unequal segments": (unknown_lag.problem, {"segments": 7}),
     "constant controls": (unknown_lag.problem, {"control": "constant", "substeps": 2}),
     "several states": (lambda: mass_chain.problem(masses=3), {"substeps": 3, "intervals": 40}),
     "a segment for each": (lambda: mass_chain.problem(masses=2), {"segments": 50, "intervals": 50}),
+    "two forward": (two_forward, {}),
     "a loop": (lqg_double_integrator.problem, {}),
     "a loop and a free duration": (mars_entry.problem, {}),
     "no matrices": (bryson_denham.problem, {"intervals": 30, "segments": 4}),
@@ -90,7 +106,7 @@ def test_segments_that_the_library_cannot_take_are_none(monkeypatch: pytest.Monk
     assert segments_of_numbers(few, short, *asked) is None
 
 
-@pytest.mark.parametrize("make", [mars_entry.problem, lqg_double_integrator.problem, unknown_lag.problem])
+@pytest.mark.parametrize("make", [mars_entry.problem, lqg_double_integrator.problem, unknown_lag.problem, two_forward])
 def test_steps_from_many_starts_are_the_steps_of_the_matrices(make: Any):
     """Forward and backward, of different lengths, from covariances of any size."""
     statement, mesh, t = started(make())
@@ -105,10 +121,10 @@ def test_steps_from_many_starts_are_the_steps_of_the_matrices(make: Any):
         along = [t.x[:-1].T, t.x[1:].T, begin, end, s, length, *rest]
         if turned:
             along = [t.x[1:].T, t.x[:-1].T, end, begin, s + length, -length, *rest]
-        size = len(statement.augmented)
-        roots = rng.standard_normal((mesh.intervals, size, size))
-        halves = pack(roots @ roots.transpose(0, 2, 1))
-        assert halves.shape == (mesh.intervals, half_length(size))
+        sizes = [statement.matrices[i].size for i in positions]
+        roots = [rng.standard_normal((mesh.intervals, size, size)) for size in sizes]
+        halves = np.hstack([pack(root @ root.transpose(0, 2, 1)) for root in roots])
+        assert halves.shape == (mesh.intervals, sum(map(half_length, sizes)))
         found = compiled_step(statement, mesh, positions, halves, along)
         assert found is not None
         step = matrices_step(statement, positions, mesh.step).map(mesh.intervals)
