@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.buffered import Buffered
 from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
+from covocp.passage.sweep import make_room
 from covocp.transcription.program import Program
 
 Outputs = tuple[Array, ...]
@@ -49,7 +50,13 @@ class AtPoint:
         self._full = Buffered(ca.Function("full", [w, p], [cost, *outputs]))
         self._value = Buffered(ca.Function("value", [w, p], [program.f, *outputs[:1]]))
         self._points: dict[bytes, Outputs | None] = {}
+        self.rest()
         self._trial: tuple[bytes, Outputs | None] = b"", None
+
+    def rest(self) -> None:
+        """Before and after many calls: where they take much memory, nothing is kept beside it."""
+        if self._full.large:
+            make_room()
 
     def full(self, w: Array, p: Array) -> Outputs | None:
         """Cost, rows, slope of the cost, entries of the Jacobian of the rows; None where the model fails."""

@@ -91,6 +91,13 @@ class Round:
     __repr__ = short_repr
 
 
+def within_bounds(nlp: Program, point: Point, parameters: Arrays) -> Point:
+    """A point within its bounds, which Ipopt passes by a share of the scales: that may cost more than is left."""
+    bounds = nlp.bounds(parameters)
+    w = np.clip(point.w, bounds["lbx"], bounds["ubx"])
+    return replace(point, w=w, where=nlp.unpack(w, parameters))
+
+
 class FirstOrder:
     """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
 

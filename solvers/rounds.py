@@ -13,6 +13,9 @@ UNMOVED = 1.0 + 1e-9
 HELPED = 0.5
 # Share of the cost by which one of several points that have converged is dearer than another.
 DEARER = 1e-6
+# A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
+# of what is too much, between these.
+ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
 
 
 def left(entry: Round) -> float:
@@ -51,3 +54,8 @@ def cost(entry: Round) -> float:
     found = entry.residuals
     saved = 0.0 if found is None else found.infeasibility * found.size
     return float(sum(part["running"] + part["terminal"] for part in entry.where[1]["parts"])) + saved
+
+
+def share_for(times: float) -> float:
+    """How much less is asked for, as a share, where there is so many times too much."""
+    return float(np.clip(ENOUGH / times, STRICTEST, STRICTER))

@@ -33,8 +33,9 @@ from covocp.solvers.reached import (
     residuals,
     similar,
     vanished,
+    within_bounds,
 )
-from covocp.solvers.rounds import HELPED, best_of, helped, left
+from covocp.solvers.rounds import HELPED, best_of, helped, left, share_for
 from covocp.solvers.statuses import Status, status_of
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.separable import FOR_OWN, slopes
@@ -46,10 +47,7 @@ LARGEST_ROUNDS = 6
 MOST_IDLE = 6
 # So many of them are in the scales that the user gave; where these do not do, the point tells better.
 GIVEN_ROUNDS = 3
-# A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
-# of what is too much, between these.
-ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
-# Iterations of such a run, if none before took more; of one that learns its Hessian.
+# Iterations of a run that met its tolerance but not the limit, if none before took more; where the Hessian is learnt.
 FEW_MORE, FEW_MORE_LEARNT = 50, 300
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
@@ -231,7 +229,7 @@ class Runs:
             scales = reached_scales(nlp, where[0], parameters, again=again)
             found = residuals(first, point, parameters, where, scales)
             if not found.hold(self._limit):
-                inside = _within(nlp, point, parameters)
+                inside = within_bounds(nlp, point, parameters)
                 its = residuals(first, inside, parameters, inside.where, scales)
                 kept = found.hold_of_changes(self._limit)
                 if its.hold(self._limit) or (not kept and its.hold_of_changes(self._limit)):
@@ -317,7 +315,10 @@ class Runs:
     def _called(self, solver: Any, arguments: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """What the solver returns, and its counts; where it gives up by raising, the start."""
         try:
-            return solver(**arguments), dict(solver.stats())
+            found = solver(**arguments), dict(solver.stats())
+            if (together := self._together()) is not None:
+                together.rest()
+            return found
         except (RuntimeError, np.linalg.LinAlgError) as error:
             w0, rows = arguments["x0"], arguments["lbg"].size
             reason = str(error).strip().splitlines()[-1]
@@ -483,18 +484,6 @@ class Runs:
 def _numbers(value: Any) -> Array:
     """What a solver gives, a matrix of CasADi's or an array, as numbers one after the other."""
     return as_array(value).ravel().astype(float, copy=False)
-
-
-def share_for(times: float) -> float:
-    """How much less is asked for, as a share, where there is so many times too much."""
-    return float(np.clip(ENOUGH / times, STRICTEST, STRICTER))
-
-
-def _within(nlp: Program, point: Point, parameters: Arrays) -> Point:
-    """A point within its bounds, which Ipopt passes by a share of the scales: that may cost more than is left."""
-    bounds = nlp.bounds(parameters)
-    w = np.clip(point.w, bounds["lbx"], bounds["ubx"])
-    return replace(point, w=w, where=nlp.unpack(w, parameters))
 
 
 def extremals(last: Round, parameters: Arrays) -> tuple[Extremal, ...]:

@@ -25,7 +25,8 @@ from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes, Point, Round
 from covocp.solvers.reduced.engine import Engine
 from covocp.solvers.reduced.statuses import Status
-from covocp.solvers.runs import Kind, Runs, share_for
+from covocp.solvers.rounds import share_for
+from covocp.solvers.runs import Kind, Runs
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.program import Arrays, Program, Trajectories, alone

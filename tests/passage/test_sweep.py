@@ -15,8 +15,8 @@ from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
 from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpack_symbolic
 from covocp.base.quadrature import gauss_matrix, riccati_step
 from covocp.models import mars_entry, mass_chain
-from covocp.passage import library
-from covocp.passage.sweep import _sweep, depends, entries_of, passed_by, values_by
+from covocp.passage import library, sweep
+from covocp.passage.sweep import _sweep, depends, entries_of, from_one, passed_by, values_by
 from covocp.transcription import shooting
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -348,3 +348,47 @@ def test_a_library_of_another_version_is_not_used(monkeypatch):
     there, said = library._loaded.__wrapped__()
     assert there is None
     assert f"built from version {known} of its source, not {known + 1}" in said
+
+
+@pytest.mark.parametrize("n", [19, 20, 24, 33, 40, 61])
+def test_steps_of_sizes_about_those_of_blocks_are_riccatis_solution(n: int) -> None:
+    """Sizes whose last block is whole, and those where it is not; against full systems, step by step."""
+    E, H1, H2 = systems(n, n, h=0.02)
+    points = entries_of([ca.DM(H1), ca.DM(H2)], n)
+    first, second = (np.asarray(ca.DM(point).full()) for point in (points.first, points.second))
+    found = unpack(from_one(pack(E), (first, second), n, points.pattern, 1).T, n)
+    for k in range(STEPS):
+        own = slice(2 * n * k, 2 * n * (k + 1))
+        D = np.asarray(ca.DM(gauss_matrix((ca.DM(H1[:, own]), ca.DM(H2[:, own])), n, LINEAR_SOLVER)).full())
+        Z = D @ np.vstack([np.eye(n), E])
+        expected = np.linalg.solve(Z[:n].T, Z[n:].T).T
+        np.testing.assert_allclose(found[k], expected, rtol=1e-10, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_array_equal(found[k], found[k].T)
+        E = found[k]
+
+
+def test_rows_are_exchanged_where_a_pivot_is_small() -> None:
+    """A transition that turns every pair of states by a right angle has pivots of zero without it."""
+    n, angle = 32, 0.5 * np.pi
+    F = np.kron(np.eye(n // 2), [[0.0, angle], [-angle, 0.0]])
+    H = np.block([[-F.T, np.zeros((n, n))], [np.zeros((n, n)), F]])
+    E = np.diag(np.arange(1.0, n + 1.0))
+    points = entries_of([ca.DM(H), ca.DM(H)], n)
+    entries = [np.asarray(ca.DM(point).full()) for point in (points.first, points.second)]
+    found = unpack(from_one(pack(E), entries, n, points.pattern, 1).T, n)[0]
+    # of a linear system with constant coefficients the method gives the diagonal Pade approximant of order four
+    numerator, denominator = (np.eye(n) + s * F / 2 + F @ F / 12 for s in (1.0, -1.0))
+    D = np.linalg.solve(denominator, numerator)
+    np.testing.assert_allclose(found, D @ E @ D.T, rtol=1e-12, atol=1e-11)
+
+
+def test_memory_is_given_back_and_taken_again() -> None:
+    """Nothing is kept after it; what follows is the same."""
+    E, H1, H2 = systems(12, 3)
+    points = entries_of([ca.DM(H1), ca.DM(H2)], 12)
+    before = np.asarray(ca.DM(passed_by(ca.DM(pack(E)), points)).full())
+    assert sweep._WORKSPACES._held > 0
+    sweep.make_room()
+    assert sweep._WORKSPACES._held == 0
+    assert not sweep._WORKSPACES._kept
+    np.testing.assert_array_equal(np.asarray(ca.DM(passed_by(ca.DM(pack(E)), points)).full()), before)

@@ -90,6 +90,19 @@ def test_segments_are_those_of_shooting(name: str):
             assert apart(*(unpack(values[block.span].T, block.size) for values in (own, expected))) <= 1e-9
 
 
+@pytest.mark.parametrize("name", ["one sensor", "a loop", "no matrices"])
+def test_of_the_nodes_every_so_many_are_given(name: str):
+    """With gaps and costs of all intervals."""
+    make, options = CASES[name]
+    statement, mesh, t = started(make(), **(options | {"intervals": 40}))
+    given = t.x[list(mesh.starts)].T, t.e[0], (t.u.T, float(t.duration), statement.values)
+    every, some = (segments_of_numbers(statement, mesh, *given, apart) for apart in (1, 4))
+    assert every is not None
+    assert some is not None
+    for one, other in zip((every.gaps, every.costs, every.x[:, ::4], every.e[:, ::4]), some, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_segments_that_the_library_cannot_take_are_none(monkeypatch: pytest.MonkeyPatch):
     """Matrices that are variables, a function that is not known, and fewer columns than pay."""
     statement, mesh, t = started(unknown_lag.problem())

@@ -28,6 +28,11 @@ class Buffered:
         self._results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         self._kept = self._memory() if function.sz_w() <= MOST_KEPT else None
 
+    @property
+    def large(self) -> bool:
+        """Whether it takes memory anew for each call."""
+        return self._kept is None
+
     def _memory(self) -> tuple[Any, Any]:
         """What CasADi works in, and the call."""
         buffer: Any

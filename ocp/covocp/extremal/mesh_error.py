@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from math import gcd
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from covocp.transcription.halved_steps import Refined, refined_run
 from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
 from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import magnitudes
-from covocp.transcription.trajectory import Multipliers, Trajectory
+from covocp.transcription.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from covocp.extremal.links import Within
@@ -43,16 +42,13 @@ LONG_STEPS = 1e-2
 ALONG, OPTIMISED = 1e-4, 2e-3
 # Order of the steps, by how much they are divided at a time at most, and how many there may be in an interval.
 ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
-# What steps that are far too long say is too much: before a run they are looked at again from so many times as many on.
-LOOKED_AGAIN = 3.0
 # Steps of an interval that what an unstable plant makes of them may ask for, and the share of what its segments are off
 # by halving the steps that is their own: more of it would be left by any steps.
 MOST_AGAINST_GROWTH, OWN_SHARE = 8, 0.3
 # A plant is called unstable from so many times what the segments by themselves are off, all together, on.
 UNSTABLE = 10.0
-# By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
-# less than it will be unless the steps are far too long there.
-MARGIN, BEFORE = 1.5, 2.0
+# By how much the change shall be smaller than allowed: it is an estimate.
+MARGIN = 1.5
 # Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not (all of
 # them are blind to multiples of 4004 periods in a step alone); and how many times more than these they must say: a jump
 # of the model within a step is seen by all, up to four times as much.
@@ -234,6 +230,12 @@ def _parted_run(
     return refined_run(statement, mesh, trajectory, np.array(parameters), parts)
 
 
+def forget_runs() -> None:
+    """Forget what is remembered: runs along a guess are asked for no more, and of many states they are large."""
+    for remembered in (_halved_run, _parted_run, _magnitudes):
+        remembered.cache_clear()
+
+
 @lru_cache(maxsize=2)
 def _magnitudes(statement: Statement, trajectory: Trajectory, parameters: tuple[float, ...]) -> Scales:
     return magnitudes(statement, trajectory, np.array(parameters))
@@ -339,10 +341,10 @@ def finer_steps(
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
-    return _unlike(extremal, options, allowed) or _divided(extremal, options, allowed, running)
+    return unlike(extremal, options, allowed) or divided(extremal, options, allowed, running)
 
 
-def _unlike(extremal: Extremal, options: Options, allowed: float, gaps: Array | float = 0.0) -> Options | None:
+def unlike(extremal: Extremal, options: Options, allowed: float, gaps: Array | float = 0.0) -> Options | None:
     """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
     unit = step_unit(extremal.statement, extremal.mesh)
     numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
@@ -355,7 +357,7 @@ def _unlike(extremal: Extremal, options: Options, allowed: float, gaps: Array | 
     return None
 
 
-def _divided(
+def divided(
     extremal: Extremal,
     options: Options,
     allowed: float,
@@ -415,55 +417,6 @@ def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, mar
     own = refined_run(extremal.statement, mesh, extremal.trajectory, extremal.parameters, parts=1).jumps
     halved = _halved(extremal).jumps
     return error if np.abs(own).max() <= OWN_SHARE * np.abs(halved).max() else 0.0
-
-
-def steps_along(
-    statement: Statement,
-    mesh: Mesh,
-    guess: Trajectory,
-    parameters: Array,
-    options: Options,
-    allowed: float,
-    *,
-    fast_alone: bool,
-) -> Options | None:
-    """`finer_steps` along a guess, whose matrices are made first: before a run that would be made again.
-
-    Args:
-        statement: a problem.
-        mesh: of the options.
-        guess: states where the segments start, and controls; all states and matrices where these are no result.
-        parameters: of the statement.
-        options: of the mesh.
-        allowed: largest change, relative to the range of each entry.
-        fast_alone: whether only what changes within the steps is looked for: a run that misses it may find no way.
-
-    Returns:
-        None where the steps are short enough, or cannot be shorter.
-    """
-    without = Multipliers.zero(statement, mesh)
-    start = Extremal(stated=statement, mesh=mesh, trajectory=guess, parameters=parameters, multipliers=without)
-    if fast_alone:
-        along, gaps = _by_own_steps(start) if changes_within_steps(start) else (start, None)
-        return None if gaps is None else _unlike(along, options, allowed, gaps)
-    found, margin = None, 1.0
-    allowed /= BEFORE
-    while True:
-        along, gaps = _by_own_steps(start)
-        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=gaps)
-        if finer is None:
-            return found
-        found, times = finer, int(finer.substeps) / start.mesh.substeps
-        if times < LOOKED_AGAIN or int(finer.substeps) >= MOST_SUBSTEPS // 2:
-            return found
-        options, margin = finer, 1.0 / BEFORE
-        start = replace(start, mesh=replace(start.mesh, substeps=int(finer.substeps)))
-
-
-def _by_own_steps(start: Extremal) -> tuple[Extremal, Array]:
-    """A guess with what its own steps make of its states and matrices, and the gaps at the ends of the segments."""
-    own = refined_run(start.statement, start.mesh, start.trajectory, start.parameters, parts=1)
-    return replace(start, trajectory=replace(start.trajectory, x=own.states, e=own.matrices)), own.jumps
 
 
 def _moved(jumps: Array, x: Array, least: Array) -> float:

@@ -100,6 +100,12 @@ def _whole(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters:
     return replace(run, states=states, matrices=matrices)
 
 
+def forget_runs() -> None:
+    """Forget what is remembered of trajectories that are asked for no more."""
+    for remembered in (_nominal, _whole):
+        remembered.cache_clear()
+
+
 def _largest(change: Array) -> Array:
     """Largest change of each entry; inf where one is no number."""
     return np.asarray(np.nan_to_num(np.abs(change).max(axis=0, initial=0.0), nan=np.inf, posinf=np.inf))

@@ -21,6 +21,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passage_bytes": (ctypes.c_size_t, (_ADDRESS, _WHOLE, ctypes.c_size_t)),
     "passage_held": (ctypes.c_size_t, (_ADDRESS,)),
     "passage_free": (None, (_ADDRESS,)),
+    "passage_trim": (None, ()),
     "passage_forward": (None, (_ADDRESS,) * 7),
     "passage_reverse": (_WHOLE, (_ADDRESS,) * 12),
     "passage_tangent": (_WHOLE, (_ADDRESS,) * 19),

@@ -8,6 +8,10 @@
 
 #include "library.h"
 
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
+
 #define NAME(function) function
 #include "calls.h"
 #include "places.h"
@@ -84,6 +88,13 @@ EXPORT size_t passage_bytes(const int *shape, int lean, size_t most) {
 
 /* Bytes that it has now. */
 EXPORT size_t passage_held(const Kept *k) { return k->held; }
+
+/* Gives back to the system what the process has freed, where its C library would keep it. */
+EXPORT void passage_trim(void) {
+#ifdef __GLIBC__
+    malloc_trim(0);
+#endif
+}
 
 /* What exported code computes, by the same operations: not those for newer processors. */
 EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }

@@ -15,7 +15,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_length
 from covocp.base.nodes import Buffers, Node
 from covocp.base.short_repr import short_repr
-from covocp.passage.library import needed
+from covocp.passage.library import functions, needed
 from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
@@ -207,6 +207,11 @@ class _Workspaces:
             self._held += held
             self._free(0, 1)
 
+    def empty(self) -> None:
+        """Free all that is kept."""
+        with self._lock:
+            self._free(KEPT_BYTES, 0)
+
     def _taken(self, place: int) -> int:
         """The memory at a place, which is no longer kept."""
         _, memory, held = self._kept.pop(place)
@@ -220,6 +225,13 @@ class _Workspaces:
 
 
 _WORKSPACES = _Workspaces()
+
+
+def make_room() -> None:
+    """Give back to the system what passages keep and what the process has freed, before or after much is taken."""
+    if functions() is not None:
+        _WORKSPACES.empty()
+        needed()["passage_trim"]()
 
 
 @cache

@@ -19,7 +19,8 @@ from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluation_mesh
-from covocp.extremal.mesh_error import OPTIMISED, steps_along
+from covocp.extremal.guessed_steps import steps_along
+from covocp.extremal.mesh_error import OPTIMISED
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_form, mention_gap, mention_limits

@@ -127,11 +127,10 @@ class _Runs:
     def _of_numbers(self, x: Array, e: Array, u: Array, duration: Array, parameters: Array) -> list[Array] | None:
         """The same by the compiled library alone, where it can."""
         given = u, float(duration.item()), parameters[:, 0]
-        found = segments_of_numbers(self._statement, self._mesh, x, e[:, 0], given)
+        found = segments_of_numbers(self._statement, self._mesh, x, e[:, 0], given, self._parts)
         if found is None:
             return None
-        none, at_nodes = np.zeros((0, found.gaps.shape[1])), (found.x, found.e)
-        return [found.gaps, none, found.costs[None], *(values[:, :: self._parts] for values in at_nodes)]
+        return [found.gaps, np.zeros((0, found.gaps.shape[1])), found.costs[None], found.x, found.e]
 
     def _shot(self, start: list[Any]) -> list[Any]:
         variables = SimpleNamespace(**dict(zip(_STARTS, start, strict=True)))

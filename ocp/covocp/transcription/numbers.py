@@ -22,7 +22,7 @@ from covocp.transcription.steps import nominal_interval, read_by, simpson_interv
 
 class Segments(NamedTuple):
     """Segments that were run: gaps of the states at their ends (nx, segments), running cost of each interval (N,),
-    states (nx, N + 1) and half-vectors (ne, N + 1) at the nodes, those at which a segment starts as given.
+    states and half-vectors at the nodes that are wanted, a column each; those at which a segment starts as given.
     """
 
     gaps: Array
@@ -32,7 +32,7 @@ class Segments(NamedTuple):
 
 
 def segments_of_numbers(
-    statement: Statement, mesh: Mesh, starts: Array, e0: Array, controls: tuple[Array, float, Array]
+    statement: Statement, mesh: Mesh, starts: Array, e0: Array, controls: tuple[Array, float, Array], apart: int = 1
 ) -> Segments | None:
     """What `shoot` gives of numbers where the nominal runs alone and all that is wanted lies at the nodes.
 
@@ -42,6 +42,7 @@ def segments_of_numbers(
         starts: states where the segments start, and at the end, (nx, segments + 1).
         e0: half-vectors at the start, (ne,).
         controls: (nu, control nodes); T [s]; parameters of the statement.
+        apart: of the nodes every so many are wanted; a share of the intervals.
 
     Returns:
         The segments; None where the library cannot take the model, or does not pay.
@@ -62,7 +63,7 @@ def segments_of_numbers(
     before = np.empty((n, m, statement.nx))
     before[:, 0], before[:, 1:] = nodes[:, :n].T, after.T.reshape(n, m, -1)[:, :-1]
     steps = [before.reshape(n * m, -1).T, after, *columns]
-    every = 1 if statement.running_uses_matrices else m
+    every = 1 if statement.running_uses_matrices else m * apart
     e = _matrices(statement, mesh, e0, _last(statement, nodes[:, -1], duration, parameters), steps, every)
     if e is None:
         return None
@@ -70,7 +71,8 @@ def segments_of_numbers(
         along = nodes[:, :n], e[:, :-1:m], after, e[:, 1:], *columns_of_parts(mesh, 1, u, duration, parameters)
         costs = costs + matrix_costs(statement, mesh, along)
     gaps = ends[:, [i - 1 for i in mesh.starts[1:]]] - starts[:, 1:]
-    return Segments(gaps=gaps, costs=costs, x=nodes, e=e[:, :: m // every])
+    wanted = e if every > 1 or m * apart == 1 else e[:, :: m * apart].copy()
+    return Segments(gaps=gaps, costs=costs, x=nodes[:, ::apart].copy(), e=wanted)
 
 
 def matrix_costs(statement: Statement, mesh: Mesh, columns: tuple[Array, ...]) -> Array:
