@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
@@ -13,12 +13,15 @@ import numpy as np
 from covocp.base.expressions import Given, sequence_of
 from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
+from covocp.base.threads import cached
 from covocp.passage.library import functions, needed
-from covocp.passage.operations import Program, program
+from covocp.passage.operations import OF_TWO, Program, program
 
 # Columns from which on it pays: to read an operation takes 2 us, which a thousand columns save; a solve asks for some
 # twenty runs.
 FEWEST = 32
+# Operations of a derivative for each of the function, at most.
+MOST_TIMES = 12
 
 
 class Owner(Protocol):
@@ -132,20 +135,22 @@ class _Kept:
             return None
         if function not in self._told:
             listed = program(function)
-            self._told[function] = None if listed is None else OnColumns(function, listed)
+            self._told[function] = None if listed is None else OnColumns.of(function, listed)
         return self._told[function]
 
     def columns(self, function: ca.Function, count: int, name: str = "", options: Given = None) -> ca.Function:
         """A node where it pays, else CasADi's map."""
         told = self.told(function) if count >= FEWEST else None
-        return function.map(count) if told is None else _Columns(self, function, (count, 1), told, name, options)
+        if told is None:
+            return function.map(count)
+        return _Columns(self, _Source.of(function), (count, 1), told, name, options)
 
     def sequences(self, function: ca.Function, steps: int, sequences: int) -> ca.Function:
         """A node of sequences where these can be had, else CasADi's."""
         told = self.told(function)
         if told is None or not told.plain:
             return _of_casadi(function, steps, sequences)
-        return _Columns(self, function, (sequences, steps), told)
+        return _Columns(self, _Source.of(function), (sequences, steps), told)
 
 
 def _of_casadi(function: ca.Function, steps: int, sequences: int) -> ca.Function:
@@ -165,19 +170,55 @@ def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
 class OnColumns:
     """A function of scalars as the library is told of it, on numbers that lie column after column."""
 
-    def __init__(self, function: ca.Function, listed: Program) -> None:
+    def __init__(self, inputs: list[ca.Sparsity], outputs: list[ca.Sparsity], listed: Program, registers: int) -> None:
         """Keep what the library points to."""
         self._run = needed()["columns"]
-        self.inputs = [function.sparsity_in(i) for i in range(function.n_in())]
-        self.outputs = [function.sparsity_out(i) for i in range(function.n_out())]
+        self.inputs, self.outputs, self._registers = inputs, outputs, max(registers, 1)
         self._listed, heights = listed, [shape.nnz() for shape in (*self.inputs, *self.outputs)]
         self._heights = np.array(heights, np.intc)
+        self._derived: dict[tuple[str, tuple[bool, ...]], OnColumns | None] = {}
         rows, constants = listed
-        self._told = (
-            *(len(rows), rows.ctypes.data, constants.ctypes.data, max(function.sz_w(), 1)),
-            *(len(self.inputs), self._heights.ctypes.data),
-        )
+        self._operations = len(rows), rows.ctypes.data, constants.ctypes.data, self._registers
+        self._told = *self._operations, len(self.inputs), self._heights.ctypes.data
         self._places = ctypes.c_void_p * len(heights)
+
+    @classmethod
+    def of(cls, function: ca.Function, listed: Program) -> OnColumns:
+        """Of a function of CasADi's and its operations."""
+        inputs = [function.sparsity_in(i) for i in range(function.n_in())]
+        outputs = [function.sparsity_out(i) for i in range(function.n_out())]
+        return cls(inputs, outputs, listed, function.sz_w())
+
+    def derived(self, kind: str, moving: tuple[bool, ...]) -> OnColumns | None:
+        """Its derivative along one direction, with the arguments and results that CasADi gives it; remembered.
+
+        Args:
+            kind: "forward" or "reverse".
+            moving: of each argument, whether it is differentiated by it.
+
+        Returns:
+            None where that takes more operations than is thought of, or arguments are sparse.
+        """
+        key = kind, moving
+        if key not in self._derived:
+            self._derived[key] = self._derivative(kind == "reverse", moving) if self.whole else None
+        return self._derived[key]
+
+    def _derivative(self, reverse: bool, moving: tuple[bool, ...]) -> OnColumns | None:
+        ends = (self.outputs, self.inputs) if reverse else (self.inputs, self.outputs)
+        most = MOST_TIMES * len(self._listed[0]) + 2 * int(self._heights.sum()) + MOST_TIMES
+        rows, constants = np.empty((most, 4), np.intc), np.empty(most)
+        wanted, there, registers = np.array(moving, np.intc), np.empty(len(ends[1]), np.intc), np.zeros(1, np.intc)
+        count = needed()["derived_program"](
+            *(reverse, *self._operations, len(self.inputs), len(self.outputs), self._heights.ctypes.data),
+            *(wanted.ctypes.data, OF_TWO.ctypes.data, most, rows.ctypes.data, constants.ctypes.data),
+            *(there.ctypes.data, registers.ctypes.data),
+        )
+        if count < 0:
+            return None
+        found = [shape if own else ca.Sparsity(*shape.shape) for shape, own in zip(ends[1], there, strict=True)]
+        given = [*self.inputs, *(ca.Sparsity(*shape.shape) for shape in self.outputs), *ends[0]]
+        return OnColumns(given, found, (rows[:count].copy(), constants[:count].copy()), int(registers[0]))
 
     @property
     def plain(self) -> bool:
@@ -217,13 +258,32 @@ class OnColumns:
         return int(self._run(*self._told, self._places(*addresses), steps, count))
 
 
+class _Source:
+    """A function of CasADi's that is made when it is asked for: derivatives that the library makes have none before."""
+
+    def __init__(self, name: str, moving: list[bool] | None, make: Callable[[], ca.Function]) -> None:
+        """Take its name, by which arguments it may be differentiated (None: CasADi says so), and what makes it."""
+        self.name, self.moving, self._make = name, moving, make
+
+    @classmethod
+    def of(cls, function: ca.Function) -> _Source:
+        """Of a function that is there."""
+        moving = [function.is_diff_in(i) for i in range(function.n_in())]
+        return cls(function.name(), moving, lambda: function)
+
+    @cached
+    def function(self) -> ca.Function:
+        """The function."""
+        return self._make()
+
+
 class _Columns(Node):
     """A function of scalars on columns, or on sequences of them."""
 
     def __init__(
         self,
         kept: _Kept,
-        function: ca.Function,
+        source: _Source,
         size: tuple[int, int],
         told: OnColumns,
         name: str = "",
@@ -231,15 +291,15 @@ class _Columns(Node):
     ) -> None:
         """Keep what the library is told; size: sequences, and steps of each."""
         self._kept = kept
-        self._function, self._told = function, told
+        self._source, self._told = source, told
         self._count, self._steps = size
         self._derived: dict[tuple[str, int], ca.Function] = {}
         widths = [self._count, *[self._count * self._steps] * (len(told.inputs) - 1 + len(told.outputs))]
         shapes = [beside(own, width) for own, width in zip((*told.inputs, *told.outputs), widths, strict=True)]
         inputs, outputs = shapes[: len(told.inputs)], shapes[len(told.inputs) :]
-        own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(inputs))], **(options or {})}
+        own = {} if source.moving is None else {"is_diff_in": source.moving}
         kind = "columns" if self._steps == 1 else "sequences"
-        super().__init__(name or f"{kind}_{function.name()}", inputs, outputs, own)
+        super().__init__(name or f"{kind}_{source.name}", inputs, outputs, own | dict(options or {}))
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -252,8 +312,8 @@ class _Columns(Node):
     def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
         """Of CasADi: columns have nothing to do with one another, and sequences are CasADi's own."""
         if self._steps > 1:
-            return _of_casadi(self._function, self._steps, self._count).jac_sparsity(oind, iind)
-        return ca.diagcat(*[self._function.jac_sparsity(oind, iind)] * self._count)
+            return _of_casadi(self._source.function, self._steps, self._count).jac_sparsity(oind, iind)
+        return ca.diagcat(*[self._source.function.jac_sparsity(oind, iind)] * self._count)
 
     def has_reverse(self, nadj: int) -> bool:
         """Of CasADi."""
@@ -281,9 +341,17 @@ class _Columns(Node):
         if found is not None:
             return found
         if self._steps > 1:
-            made = getattr(_of_casadi(self._function, self._steps, self._count), kind)(directions)
+            made = getattr(_of_casadi(self._source.function, self._steps, self._count), kind)(directions)
         elif directions > 1:
-            made = getattr(self._function.map(self._count), kind)(directions)
+            made = getattr(self._source.function.map(self._count), kind)(directions)
         else:
-            made = self._kept.columns(getattr(self._function, kind)(1), self._count, name, options)
+            made = self._along_one(kind, name, options)
         return self._derived.setdefault((kind, directions), made)
+
+    def _along_one(self, kind: str, name: str, options: Given) -> ca.Function:
+        """The derivative along one direction by the library's own rules, where that can be, else by CasADi's."""
+        told = self._told.derived(kind, tuple(self.is_diff_in(i) for i in range(self.n_in())))
+        if told is None:
+            return self._kept.columns(getattr(self._source.function, kind)(1), self._count, name, options)
+        source = _Source(f"{kind}_{self._source.name}", None, lambda: getattr(self._source.function, kind)(1))
+        return _Columns(self._kept, source, (self._count, 1), told, name, options)

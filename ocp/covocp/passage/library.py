@@ -38,6 +38,10 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
         + (_WHOLE,)
         + (_ADDRESS,) * 3,
     ),
+    "derived_program": (
+        _WHOLE,
+        (_WHOLE, _WHOLE) + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 3 + (_WHOLE,) + (_ADDRESS,) * 4,
+    ),
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }
 

@@ -17,6 +17,7 @@
 #include "places.h"
 #include "written.h"
 #include "listing.h"
+#include "derived.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
 EXPORT int passage_version(void) { return 14; }

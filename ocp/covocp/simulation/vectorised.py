@@ -147,7 +147,7 @@ def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Col
     """
     listed = program(function) if functions() is not None else None
     if listed is not None:
-        return _compiled(function, width, shared, OnColumns(function, listed))
+        return _compiled(function, width, shared, OnColumns.of(function, listed))
     if function.is_a("SXFunction"):
         known = {*OPERATIONS, ca.OP_IF_ELSE_ZERO, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
         if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
