@@ -16,6 +16,7 @@ from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
+from covocp.passage.columns import in_columns
 from covocp.passage.sweep import passed_by
 from covocp.statement.conditions import Columns, Conditions, Inside
 from covocp.statement.statement import Statement
@@ -89,7 +90,8 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
         e = seen = z[st.nx :, :]
     else:
-        ends, fine, cost = nominal_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
+        advance = in_columns(st, nominal_interval(st, mesh.substeps, mesh.step), n)
+        ends, fine, cost = advance(z[:, :-1], *common)
         e = seen = ca.MX(0, n + 1)
         if st.matrices:
             passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1] + none[0])
