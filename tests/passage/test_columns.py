@@ -17,7 +17,7 @@ from covocp.base.buffered import Buffered
 from covocp.models import mass_chain
 from covocp.passage import columns, library, operations
 from covocp.passage.columns import FEWEST, in_columns, in_turn, numbers_in_turn
-from covocp.transcription.covariance_steps import KEPT, gauss_points
+from covocp.transcription.covariance_steps import KEPT, gauss_entries, gauss_points
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
@@ -153,6 +153,62 @@ def test_a_function_of_which_a_copy_is_in_its_text_is_told_from_it():
         assert read is not None
         np.testing.assert_array_equal(read[0], rows)
         np.testing.assert_array_equal(read[1], constants)
+
+
+def slopes_of(function: ca.Function, arguments: int, count: int) -> ca.Function:
+    """(arguments, weights, direction) -> slopes of weighted results, tangent, tangent of the slopes."""
+    x, weights = ca.MX.sym("x", arguments, count), ca.MX.sym("weights", 1, count)
+    direction = ca.MX.sym("direction", arguments, count)
+    value = function(*(x[i, :] for i in range(arguments)))
+    slope = ca.jtimes(value, x, weights, True)
+    found = [slope, ca.jtimes(value, x, direction), ca.jtimes(slope, x, direction)]
+    return ca.Function("slopes", [x, weights, direction], [ca.densify(v) for v in found])
+
+
+@pytest.mark.parametrize("operation", [*UNARY, *BINARY])
+def test_the_rule_of_each_operation_is_casadis(operation: Any):
+    """Where both operands are alike, zero, outside of where it is defined too; of first and second order."""
+    rows = 2 if operation in BINARY else 1
+    symbols = [ca.SX.sym(name) for name in "ab"[:rows]]
+    function = ca.Function("rule", symbols, [operation(*symbols)])
+    some = [-2.5, -1.0, -0.7, -0.3, 0.0, 0.2, 0.5, 0.9, 1.0, 1.3, 2.0, 3.7]
+    points = np.array(np.meshgrid(*[some] * 2)).reshape(2, -1)[:rows]
+    count, owner = points.shape[1], Owner()
+    weights, direction = np.linspace(0.5, 1.5, count), np.linspace(-1.0, 1.2, points.size).reshape(points.shape)
+    own, plain = (slopes_of(f, rows, count) for f in (in_columns(owner, function, count), function.map(count)))
+    for one, other in zip(own(points, weights, direction), plain(points, weights, direction), strict=True):
+        np.testing.assert_allclose(one.full(), other.full(), rtol=1e-12, atol=1e-14)
+
+
+def test_a_derivative_of_many_arguments_has_few_operations():
+    """What is not asked for, and what does not move, is left out; registers are used again."""
+    function, _ = gauss_entries(mass_chain.problem(5).statement(), 0, "gauss")
+    told = columns.OnColumns.of(function, operations.program(function))
+    moving = tuple(function.is_diff_in(i) for i in range(function.n_in()))
+    for kind in ("reverse", "forward"):
+        found, expected = told.derived(kind, moving), getattr(function, kind)(1)
+        assert found is told.derived(kind, moving)
+        assert len(found._listed[0]) <= 1.2 * expected.n_instructions()
+        assert found._registers <= 3 * expected.sz_w()
+        assert [shape.shape for shape in found.outputs] == [expected.size_out(i) for i in range(expected.n_out())]
+    assert not told.derived("reverse", (False,) * len(moving)).outputs[0].nnz()
+
+
+def test_a_derivative_that_is_too_long_is_casadis(monkeypatch: pytest.MonkeyPatch):
+    """Room for no more operations than the function has; and arguments that are sparse."""
+    function, count = smooth(), 64
+    monkeypatch.setattr(columns, "MOST_TIMES", 0)
+    owners = [Owner(), Owner()]
+    kept = columns._KEPT.setdefault(owners[0], columns._Kept())
+    assert kept.told(function).derived("reverse", (True, True)) is None
+    x, p, s = ca.MX.sym("x", 3, count), ca.MX.sym("p", 2, count), ca.MX.sym("s", 2, count)
+    found = [
+        ca.Function("f", [x, p, s], [ca.jtimes(f(x, p)[0], x, s, True)])
+        for f in (in_columns(owners[0], function, count), function.map(count))
+    ]
+    rng = np.random.default_rng(2)
+    given = [rng.normal(size=shape) for shape in ((3, count), (2, count), (2, count))]
+    np.testing.assert_allclose(found[0](*given).full(), found[1](*given).full(), rtol=1e-13)
 
 
 @pytest.mark.parametrize("which", ["gradient", "tangent", "product", "jacobian"])

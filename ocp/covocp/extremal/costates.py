@@ -21,6 +21,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, state_slope
 from covocp.extremal.inside import instant_jumps
+from covocp.passage.columns import in_columns
 from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
@@ -226,7 +227,8 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> Matrices:
     e0, kicks = ca.MX.sym("e0", statement.ne), ca.MX.sym("kicks", statement.ne, n + 1)
     weights = ca.MX.sym("weights", statement.ne, n + 1)
     common = interval_columns(mesh, u, duration, p)
-    _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
+    advance = in_columns(statement, nominal_interval(statement, mesh.substeps, mesh.step), n)
+    _, states, cost = advance(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage=passed_by)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes = slopes_by(value, (x, u, duration, kicks))

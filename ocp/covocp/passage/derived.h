@@ -196,48 +196,74 @@ static void along_direction(const Primal *f, Values *v, const int *at, const int
     }
 }
 
+/* What is written out of values: operations, and which registers hold what. */
+typedef struct {
+    const Values *v;
+    int *uses, *place, *stack; /* of each value how often it is still asked for, and its register, -1: none yet */
+    int free, taken, made;
+    int *program;
+    double *constants;
+} Written;
+
+static void operation(Written *w, int kind, int one, int two, int three, double constant) {
+    int *own = w->program + 4 * w->made;
+    own[0] = kind, own[1] = one, own[2] = two, own[3] = three, w->constants[w->made++] = constant;
+}
+
+/* A register for a value. */
+static int placed_in(Written *w, int i) { return w->place[i] = w->free ? w->stack[--w->free] : w->taken++; }
+
+/* The register of a value that an operation asks for; inputs and constants are had when they are first asked for. */
+static int register_of(Written *w, int i) {
+    const Values *v = w->v;
+    if (i < 0) return 0;
+    if (w->place[i] < 0 && v->kind[i] == OP_INPUT) operation(w, OP_INPUT, v->one[i], v->two[i], placed_in(w, i), 0.0);
+    if (w->place[i] < 0) operation(w, OP_CONST, 0, 0, placed_in(w, i), v->constant[i]);
+    return w->place[i];
+}
+
+/* One use less: its register is free after the last one. */
+static void used(Written *w, int i) {
+    if (i >= 0 && !--w->uses[i]) w->stack[w->free++] = w->place[i];
+}
+
 /* The operations that give some values as results, whose heights are those given, 0: not there; their number, negative
- * where there are more than `most`. uses: of each value, to work in; registers: how many they take. */
+ * where there are more than `most`. memory: 4 times `most` numbers and one for each result; registers: how many it takes. */
 static int written_out_values(
-    Values *v, const int *results, const int *heights, int count, int *uses, int *place, int *stack, int *program,
-    double *constants, int most, int *registers
+    Values *v, const int *results, const int *heights, int count, int *memory, int *program, double *constants, int *registers
 ) {
     const int zero = number(v, 0.0);
-    int outputs = 0, free_ones = 0, taken = 0, made = 0;
+    int outputs = 0, *first = memory + 3 * v->most, *next = first + v->most;
     for (int r = 0; r < count; ++r) outputs += heights[r];
-    if (v->full || v->count + outputs > most) return -1;
-    memset(uses, 0, sizeof(int) * v->count);
-    for (int i = 0; i < outputs; ++i) ++uses[results[i] == NONE ? zero : results[i]];
-    for (int i = v->count - 1; i >= 0; --i) {
-        if (!uses[i] || v->kind[i] == OP_INPUT || v->kind[i] == OP_CONST) continue;
-        ++uses[v->one[i]];
-        if (v->two[i] >= 0) ++uses[v->two[i]];
+    if (v->full || v->count + outputs > v->most) return -1;
+    Written w = {v, memory, memory + v->most, memory + 2 * v->most, 0, 0, 0, program, constants};
+    for (int i = 0; i < v->count; ++i) w.uses[i] = 0, w.place[i] = first[i] = NONE;
+    for (int i = 0; i < outputs; ++i) {
+        const int own = results[i] == NONE ? zero : results[i];
+        ++w.uses[own], next[i] = first[own], first[own] = i;
     }
-    /* constants come first: one that was made for an operation serves others that come before it */
-    for (int first = 1; first >= 0; --first)
-        for (int i = 0; i < v->count; ++i) {
-            const int kind = v->kind[i], input = kind == OP_INPUT, fixed = kind == OP_CONST;
-            if (!uses[i] || fixed != first) continue;
-            int *own = program + 4 * made;
-            own[0] = kind, own[1] = own[2] = 0, constants[made++] = v->constant[i];
-            if (input)
-                own[1] = v->one[i], own[2] = v->two[i];
-            else if (!fixed) {
-                const int one = v->one[i], two = v->two[i];
-                own[1] = place[one], own[2] = two >= 0 ? place[two] : 0;
-                if (!--uses[one]) stack[free_ones++] = place[one];
-                if (two >= 0 && !--uses[two]) stack[free_ones++] = place[two];
-            }
-            own[3] = place[i] = free_ones ? stack[--free_ones] : taken++;
+    for (int i = v->count - 1; i >= 0; --i) {
+        if (!w.uses[i] || v->kind[i] == OP_INPUT || v->kind[i] == OP_CONST) continue;
+        ++w.uses[v->one[i]];
+        if (v->two[i] >= 0) ++w.uses[v->two[i]];
+    }
+    for (int i = 0; i < v->count; ++i) {
+        const int kind = v->kind[i], leaf = kind == OP_INPUT || kind == OP_CONST;
+        if (!w.uses[i] || (leaf && first[i] == NONE)) continue;
+        if (!leaf) {
+            const int one = register_of(&w, v->one[i]), two = register_of(&w, v->two[i]);
+            used(&w, v->one[i]), used(&w, v->two[i]);
+            operation(&w, kind, one, two, placed_in(&w, i), 0.0);
         }
-    for (int r = 0, i = 0; r < count; ++r)
-        for (int j = 0; j < heights[r]; ++j, ++i) {
-            int *own = program + 4 * made;
-            own[0] = OP_OUTPUT, own[1] = place[results[i] == NONE ? zero : results[i]], own[2] = r, own[3] = j;
-            constants[made++] = 0.0;
+        for (int at = first[i]; at != NONE; at = next[at]) {
+            int result = 0, height = at;
+            while (height >= heights[result]) height -= heights[result++];
+            operation(&w, OP_OUTPUT, register_of(&w, i), result, height, 0.0);
         }
-    *registers = taken;
-    return made;
+        for (int at = first[i]; at != NONE; at = next[at]) used(&w, i);
+    }
+    *registers = w.taken;
+    return w.made;
 }
 
 /* A derivative of a function that is told as `columns` takes it, told so: the number of its operations, negative where
@@ -255,7 +281,7 @@ EXPORT int derived_program(
     const int outputs = reverse ? arguments : results, *sizes = reverse ? heights : heights + arguments;
     size_t all = 0;
     for (int i = 0; i < outputs; ++i) all += sizes[i];
-    const size_t each = (size_t)most, whole = registers + 2 * (size_t)count + all + 7 * each;
+    const size_t each = (size_t)most, whole = registers + 2 * (size_t)count + 2 * all + 8 * each;
     int *memory = malloc(sizeof(int) * whole);
     double *real = malloc(sizeof(double) * each);
     int made = -1;
@@ -276,8 +302,7 @@ EXPORT int derived_program(
             place += sizes[r], there[r] = any, kept[r] = any ? sizes[r] : 0;
         }
         if (!v.full)
-            made = written_out_values(&v, slopes, kept, outputs, of + 4 * each, of + 5 * each, of + 6 * each, derived,
-                                      numbers, most, needed);
+            made = written_out_values(&v, slopes, kept, outputs, of + 4 * each, derived, numbers, needed);
     }
     free(memory), free(real);
     return made;
