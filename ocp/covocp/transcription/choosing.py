@@ -10,11 +10,9 @@ from covocp.transcription.before_reading import waits
 from covocp.transcription.covariance_steps import StepKind
 from covocp.transcription.mesh import STIFFNESS_PER_STEP, Mesh, Options, Stiffness, explicit_substeps, readings_at
 
-# Shooting segments where matrices are eliminated, at most and at least: as many as slopes of states by states in all of
-# them have so many entries. An iteration of Ipopt takes as long as an evaluation there (chain of masses of 28 states,
-# five segments); two are 5 % faster than five with 28 states, 10 % with 98, and of seven nonlinear problems of 20 to 28
-# states four end alike, three better by 2e-4 to a half.
-MOST_SEGMENTS, FEWEST_SEGMENTS, SEGMENT_ENTRIES = 10, 2, 1600
+# Shooting segments where matrices are eliminated; where there are many states as few as these, about so many states at
+# the starts of all: an iteration of Ipopt takes as long as an evaluation there (chain of masses of 28 and 58 states).
+ELIMINATED_SEGMENTS, FEWEST_SEGMENTS, SEGMENT_STATES = 10, 5, 120
 # Logarithm of what a change may grow to within one of them. With e^17 a regulator of an unstable plant ended away from
 # its optimum: by any control the end of a segment moves further than a cost can tell.
 GROWTH = 5.0
@@ -55,7 +53,7 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
         count = intervals
         if eliminated and statement.matrices:
             grown = float(np.nan_to_num(intervals * stiffness.growing / GROWTH, posinf=intervals))
-            usual = int(np.clip(SEGMENT_ENTRIES // max(statement.nx, 1) ** 2, FEWEST_SEGMENTS, MOST_SEGMENTS))
+            usual = int(np.clip(SEGMENT_STATES // max(statement.nx, 1), FEWEST_SEGMENTS, ELIMINATED_SEGMENTS))
             count = min(max(usual, int(np.ceil(grown))), intervals)
     else:
         count = min(options.segments, intervals)
