@@ -392,3 +392,41 @@ def test_memory_is_given_back_and_taken_again() -> None:
     assert sweep._WORKSPACES._held == 0
     assert not sweep._WORKSPACES._kept
     np.testing.assert_array_equal(np.asarray(ca.DM(passed_by(ca.DM(pack(E)), points)).full()), before)
+
+
+@pytest.mark.parametrize("change", ["none", "signs", "exchanged", "last"])
+def test_a_large_passage_that_has_moved_is_run_again(monkeypatch: pytest.MonkeyPatch, change: str) -> None:
+    """Its entries are known by a digest: two signs, two entries that change places, little of one at the last step."""
+    monkeypatch.setattr(sweep, "MOST_FACTORS", 1)
+    n, steps = 9, 24
+    rng = np.random.default_rng(7)
+    pattern = tuple(zip(*[(i, i) for i in range(2 * n)], *[(i + n, i) for i in range(n)], strict=True))
+    order = np.lexsort(pattern)
+    pattern = tuple(tuple(np.array(part)[order].tolist()) for part in pattern)
+    H = 0.05 * rng.normal(size=(len(pattern[0]), steps))
+    node = _sweep(n, pattern, steps, False, (), 0, False, 2)
+    first, ends = pack(np.eye(n)), steps // 2
+    seed = np.zeros((half_length(n), ends), order="F")
+    seed[0, -1] = 1.0
+    reverse = node.get_reverse(1, "slopes", ("",) * 5, ("",) * 3, {})
+
+    def slopes(entries: np.ndarray) -> np.ndarray:
+        given = np.asfortranarray(entries)
+        after, found = np.empty((half_length(n), ends), order="F"), np.empty_like(given)
+        node.eval_buffer((first.data, given.T.data, given.T.data), (after.T.data,))
+        reverse.eval_buffer(
+            (first.data, given.T.data, given.T.data, after.T.data, seed.T.data), (None, found.T.data, None)
+        )
+        return np.concatenate([after.ravel(), found.ravel()])
+
+    before, moved = slopes(H), H.copy()
+    if change == "signs":
+        moved[:, [3, 7]] *= -1.0
+    elif change == "exchanged":
+        moved[:, [3, 4]] = moved[:, [4, 3]]
+    elif change == "last":
+        moved[0, -1] *= 1.0 + 1e-6
+    again = slopes(moved)
+    sweep.make_room()  # what follows knows nothing of what was before
+    np.testing.assert_array_equal(again, slopes(moved))
+    assert np.array_equal(again, before) == (change == "none")

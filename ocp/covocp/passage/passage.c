@@ -65,7 +65,7 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean, size_t most) {
     memcpy(k->whole, shape, sizeof(int) * length);
     described_for(p, k->whole, lean, most);
     counts(p, k->whole + length);
-    const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = (size_t)p->nnz * p->moves;
+    const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = copied_entries(p);
     double *at = k->reals + stages(p, k->reals); /* where `keep_stages` finds them */
     at += keeps(p, at);
     at += works(p, at);

@@ -358,14 +358,13 @@ def diverges(values: Array, final: Array) -> bool:
 def simulate_matrices(
     statement: Statement, mesh: Mesh, x: Array, u: Array, e0: Array, duration: float, parameters: Array
 ) -> Array:
-    """Half-vectors at the nodes (N+1, ne) along given nodes of the nominal."""
-    if not statement.matrices:
-        return np.zeros((mesh.intervals + 1, 0))
-    if mesh.eliminated or statement.coupled:  # not variables, or driven by what is not known yet
-        return np.tile(e0, (mesh.intervals + 1, 1))
+    """Half-vectors at the nodes (N+1, ne) along given nodes of the nominal; read-only."""
+    alike = np.broadcast_to(e0, (mesh.intervals + 1, e0.size))
+    if not statement.matrices or mesh.eliminated or statement.coupled:  # no variables, or what drives them is unknown
+        return alike
     values = matrices_function(statement, mesh)(x.T, u.T, duration, parameters)
     e = np.asarray(values[0].full()).T
-    return e if np.isfinite(e).all() else np.tile(e0, (mesh.intervals + 1, 1))
+    return e if np.isfinite(e).all() else alike
 
 
 def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
