@@ -20,6 +20,7 @@ from covocp.extremal.mesh_error import (
     Unseen,
     mesh_error,
     node_error,
+    parted,
     unseen,
     unstable,
 )
@@ -96,7 +97,8 @@ def _coarse(solution: Solution, error: float) -> str:
         changes = f"changes the cost by {error:.1e} (relative)"
         return f"The mesh is too coarse: halving the integration steps {changes}. {remedy}"
     node = _node(solution)
-    paid = mesh_error(solution.extremal, solution.cost_terms["running"], solution.within, of_states=False)
+    running = parted(solution.extremal, 1).running  # that of a loop is told by other terms
+    paid = mesh_error(solution.extremal, running, solution.within, of_states=False)
     changes = f"changes the cost by {paid:.1e} (relative)"
     if error > paid:
         changes += f" and moves a state by {error:.1e} of its range between two nodes"
