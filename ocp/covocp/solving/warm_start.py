@@ -128,7 +128,8 @@ def _from_solution(
         e0 = starts(statement, mesh, parameters)[1]
         made = simulate_matrices(statement, mesh, trajectory.x, trajectory.u, e0, duration, parameters)
         trajectory = replace(trajectory, e=made)
-    if not statement.noise_varies:  # what parameters say has no better place to go on to
+    measured = any(v is not None for v in (statement.information, statement.measurement, statement.samples))
+    if measured and not statement.noise_varies:  # what parameters say has no better place to go on to
         start = [trajectory.x[0], trajectory.u[0], 0.0, duration, parameters]
         check_measured(statement, [ca.DM(given) for given in start])
     st = statement
