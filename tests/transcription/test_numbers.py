@@ -168,8 +168,8 @@ def test_a_loop_is_the_same_without_the_library(monkeypatch: pytest.MonkeyPatch)
     assert loop.other_cost == pytest.approx(loop.expected_cost, rel=1e-4)
 
 
-def test_costs_of_matrices_are_summed_as_in_shooting():
-    """By parts away from the end, and as they are near it, in groups that the library does not take."""
-    statement, mesh, t = started(mars_entry.problem())
+def test_a_loop_above_has_costs_of_both_kinds():
+    """What is compared with shooting has intervals by parts, and so few others that the library does not take them."""
+    statement, mesh, _ = started(mars_entry.problem())
     parted = numbers.parted_intervals(statement, mesh)
     assert 0 < np.count_nonzero(~parted) < columns.FEWEST < np.count_nonzero(parted)
