@@ -7,6 +7,7 @@ rows on z; the slopes of cost and rows by the states come back through the same 
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -69,6 +70,18 @@ class Layout:
     places: tuple[tuple[Indices, Indices], ...]
 
     __repr__ = short_repr
+
+    @cached_property
+    def free_rows(self) -> Indices:
+        """The entries that are no given values, of the states at the ends of all segments, one below the other."""
+        return np.concatenate([k * self.states + entries for k, entries in enumerate(self.free)])
+
+    @cached_property
+    def limited(self) -> tuple[int, ...]:
+        """Segments at whose end states have given values or bounds."""
+        return tuple(
+            k for k, pair in enumerate(zip(self.fixed, self.bounded, strict=True)) if pair[0].size + pair[1].size
+        )
 
     @property
     def gaps(self) -> int:
@@ -176,15 +189,15 @@ def condensed(layout: Layout, bounds: Bounds, w: Array, slope: Array, g: Array, 
     for k in range(1, layout.segments):
         follows[k] += slopes.chain[k - 1] @ follows[k - 1]  # fixed entries have no columns there
     flat = follows.reshape(-1, nz + 1)
-    free = np.concatenate([k * nx + entries for k, entries in enumerate(layout.free)])
-    q = slope[z] + slope[layout.given][free] @ flat[free, :nz]
+    q = slope[z] + slope[layout.given][layout.free_rows] @ flat[layout.free_rows, :nz]
     rows, values = slopes.others, g[layout.gaps :]
     if layout.rows:
         rows = rows + slopes.others_by_state @ flat[:, :nz]
         values = values + slopes.others_by_state @ flat[:, nz]
     parts = [(rows, bounds.lbg[layout.gaps :] - values, bounds.ubg[layout.gaps :] - values)]
     named = [np.arange(layout.gaps, g.size)]
-    for k, (fixed, bounded) in enumerate(zip(layout.fixed, layout.bounded, strict=True)):
+    for k in layout.limited:
+        fixed, bounded = layout.fixed[k], layout.bounded[k]
         if fixed.size:  # a given final value: the row of continuity itself
             gap = -follows[k, fixed, nz]
             parts.insert(0, (follows[k, fixed, :nz], gap, gap))

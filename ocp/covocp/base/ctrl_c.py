@@ -13,8 +13,9 @@ from types import FrameType, TracebackType
 from typing import Any
 
 # Without the conversion of their results to enumerations, which takes longer than what they do.
-_set: Callable[[int, Any], Any] = getattr(signal.signal, "__wrapped__", signal.signal)
-_get: Callable[[int], Any] = getattr(signal.getsignal, "__wrapped__", signal.getsignal)
+_bare = getattr(signal, "_signal", signal)
+_set: Callable[[int, Any], Any] = _bare.signal
+_get: Callable[[int], Any] = _bare.getsignal
 
 
 class Listener:

@@ -31,24 +31,28 @@ class _Turn:
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._held = threading.local()
+        self._owner, self._taken = 0, 0  # whose it is, and how many times; written by the owner alone
         self._limits: Limits | None = None
 
     def __enter__(self) -> None:
         self._lock.acquire()
-        if not self._depth:
+        if not self._taken:
+            self._owner = threading.get_ident()
             self._limits = one_blas_thread()
-        self._held.depth = self._depth + 1
+        self._taken += 1
 
     def __exit__(self, *_: object) -> None:
-        self._held.depth = self._depth - 1
-        if not self._depth and self._limits is not None:
-            self._limits.restore_original_limits()
+        self._taken -= 1
+        if not self._taken:
+            self._owner = 0
+            if self._limits is not None:
+                self._limits.restore_original_limits()
         self._lock.release()
 
     @property
     def _depth(self) -> int:
-        return int(getattr(self._held, "depth", 0))
+        """How many times this thread has it."""
+        return self._taken if self._owner == threading.get_ident() else 0
 
     @contextmanager
     def handed_over(self) -> Iterator[None]:
@@ -65,7 +69,7 @@ class _Turn:
     def after_fork(self) -> None:
         """A new process has one thread: what other threads held in the old one is free here."""
         depth = self._depth
-        self._lock, self._held = threading.RLock(), threading.local()
+        self._lock, self._owner, self._taken = threading.RLock(), 0, 0
         for _ in range(depth):
             self.__enter__()
 

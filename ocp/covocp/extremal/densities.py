@@ -174,6 +174,8 @@ def noises_along(extremal: Extremal, truth: Truth | None = None) -> Iterator[Noi
     """
     own, mesh = truth or Truth(extremal.statement, extremal.parameters), extremal.mesh
     st, definite = own.statement, truth is None
+    if not st.matrices and st.information is None and st.measurement is None and st.samples is None:
+        return
     known = np.flatnonzero(np.isfinite(extremal.trajectory.x).all(axis=1))
     nodes = known if st.noise_varies else known[:1]
     if not nodes.size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from covocp.statement.statement import Statement
 
 # Largest number that can be squared.
 SQUARED = float(np.sqrt(np.finfo(float).max))
+# Statements, with parameters, that have passed and are known.
+KEPT = 16
 
 
 def check_magnitudes(statement: Statement, parameters: Array) -> None:
@@ -20,7 +23,13 @@ def check_magnitudes(statement: Statement, parameters: Array) -> None:
     Raises:
         ProblemError: names the first that cannot.
     """
-    for name, what, values in _numbers(statement, parameters):
+    _check(statement, np.asarray(parameters, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=KEPT)
+def _check(statement: Statement, parameters: bytes) -> None:
+    """The same; what has passed is not looked at again."""
+    for name, what, values in _numbers(statement, np.frombuffer(parameters)):
         large = np.abs(values) > SQUARED  # never of NaN, which stands for a free one
         if large.any():
             raise ProblemError(

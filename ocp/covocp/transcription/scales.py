@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from covocp.transcription.resolution import estimated_rows, resolutions
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import Trajectory
 
+# Statements of which values at the ends and bounds are kept.
+KEPT = 16
 # Step by which the response to a control is measured: a share of its size, then of what it moves a state by. That says
 # how much it moves where it is within these; else it is tried again, up to so many times, each so many times longer or
 # shorter at most. So no unit of a control matters, whose size nothing tells.
@@ -68,7 +71,6 @@ def magnitudes(
         far: so many times what the measurements resolve.
         untold_far: whether a state of which nothing tells a magnitude has at least a share of the largest; else 1.
     """
-    lower, upper = statement.state_bounds
     ends, deviations = _prescribed(statement, parameters, PRIOR_REACHED if reached else PRIOR_AT_START)
     moved = np.abs(guess.x).max(axis=0, initial=0.0)
     found = np.max([moved, ends, deviations], axis=0)
@@ -77,11 +79,7 @@ def magnitudes(
         # of what nothing tells more than that it is known exactly an accurate sensor tells no more: 1 is left for it
         untold &= np.isfinite(resolved) & ((found > NOTHING) | (resolved > 1.0))
         found = np.where(untold, np.maximum(found, resolved), found)
-    span = np.where(upper > lower, upper - lower, np.inf)
-    limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
-    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
-    alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
-    least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
+    least, span, alone = _bounded(statement, reached)
     x = np.where(found > NOTHING, np.clip(found, least, span), alone)
     if untold_far:
         known = UNTOLD_SHARE * max((found[k] for k in statement.moving), default=0.0)
@@ -129,11 +127,37 @@ def unvanishing(
     return np.asarray(np.maximum(np.abs(found.x).max(axis=0, initial=0.0), np.where(told > NOTHING, told, 1.0)))
 
 
-def _prescribed(statement: Statement, parameters: Array, most: float) -> tuple[Array, Array]:
+@lru_cache(maxsize=KEPT)
+def _bounded(statement: Statement, reached: bool) -> tuple[Array, ...]:
+    """Least and largest magnitudes of the states (nx,) by their bounds, and what they have where nothing else tells."""
+    lower, upper = statement.state_bounds
+    span = np.where(upper > lower, upper - lower, np.inf)
+    limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
+    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
+    alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
+    least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
+    return _kept(least, span, alone)
+
+
+def _prescribed(statement: Statement, parameters: Array, most: float) -> tuple[Array, ...]:
     """Magnitudes of the states (nx,) by their values at the ends, and by their deviations: these up to a multiple."""
-    x0, xf, e0, _ = statement.boundary_values(parameters)
+    return _prescribed_by(statement, np.asarray(parameters, dtype=float).tobytes(), most)
+
+
+@lru_cache(maxsize=KEPT)
+def _prescribed_by(statement: Statement, parameters: bytes, most: float) -> tuple[Array, ...]:
+    """The same, read-only: it is asked in every solve, of parameters that stay."""
+    x0, xf, e0, _ = statement.boundary_values(np.frombuffer(parameters))
     ends = np.maximum(np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf)))
-    return ends, np.minimum(_deviations(statement, e0), most * np.where(ends > 0, ends, 1.0))
+    deviations = np.minimum(_deviations(statement, e0), most * np.where(ends > 0, ends, 1.0))
+    return _kept(ends, deviations)
+
+
+def _kept(*values: Array) -> tuple[Array, ...]:
+    """Arrays that several ask for."""
+    for value in values:
+        value.setflags(write=False)
+    return values
 
 
 def _deviations(statement: Statement, e: Array) -> Array:
