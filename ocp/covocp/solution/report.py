@@ -417,6 +417,8 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{stats['tried']} starts tried")
     if "untried" in stats and solution.within is None:
         effort.append(untried_told(stats["untried"]))
+    if "left_duration" in stats:
+        effort.append(f"cheaper than what a duration of {stats['left_duration']:.3g} s was found with")
     if stats.get("excited"):
         effort.append("another number of switches was cheaper")
     if stats.get("left_saddle"):

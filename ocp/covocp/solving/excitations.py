@@ -69,21 +69,16 @@ def otherwise_excited(
     Returns:
         The outcome of the cheaper minimum with the iterations of both runs, and its start; else what was given.
     """
-    outcome, start = found
-    if start.warm or not outcome.converged or reporter.limited or reporter.stop:
+    outcome = found[0]
+    if not may_be_left(found, statement, guess, reporter) or not has_many_minima(statement):
         return found
-    if not has_many_minima(statement) or not _free_to_choose(statement, guess):
+    coarse = made_coarse(outcome, prepared, statement, options, ready, slow)
+    if coarse is None:
         return found
     values = outcome.extremal.parameters
-    fewer = thinned(statement, options, prepared.mesh, values, COARSE)
-    own = fewer is None and not slow
-    try:
-        coarse = prepared if own else ready(options=fewer or options)
-    except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the found one counts
-        return found
     for controls in _cheaper(statement, coarse, values, outcome, reporter):
         u = resampled(controls, coarse.mesh, prepared.mesh)
-        again = _run(prepared, values, _excited(statement, prepared.mesh, outcome, u), reporter)
+        again = run_from(prepared, values, excited(statement, prepared.mesh, outcome, u), reporter)
         if again is None:
             continue
         other, at = again
@@ -100,8 +95,11 @@ def has_many_minima(statement: Statement) -> bool:
     return unknown and free and bounded and learns(statement, linked=False)
 
 
-def _free_to_choose(statement: Statement, guess: Given) -> bool:
-    """Whether no guess, of those stated and those given, says how a control moves."""
+def may_be_left(found: tuple[Outcome, Guess], statement: Statement, guess: Given, reporter: Progress) -> bool:
+    """Whether others may be compared with what was found: without limits, and no guess says how a control moves."""
+    outcome, start = found
+    if start.warm or not outcome.converged or reporter.limited or reporter.stop:
+        return False
     given: Mapping[Any, Any] = guess if isinstance(guess, Mapping) else {}
     if guess is not None and not isinstance(guess, Mapping):
         return False
@@ -110,13 +108,40 @@ def _free_to_choose(statement: Statement, guess: Given) -> bool:
     return plain and not any(block.name in named for block in statement.controls)
 
 
+def made_coarse(
+    outcome: Outcome,
+    prepared: Prepared,
+    statement: Statement,
+    options: Options,
+    ready: Callable[..., Prepared],
+    slow: bool,
+) -> Prepared | None:
+    """The problem made ready on a coarse mesh, by Ipopt; None where that fails.
+
+    Args:
+        outcome: found on the mesh itself.
+        prepared: what found it: it compares too, where its mesh is hardly finer.
+        statement: of the problem.
+        options: of its mesh.
+        ready: makes the problem ready on the mesh of other `options`.
+        slow: whether the method that ran takes much longer than Ipopt, which then compares on a fine mesh too.
+    """
+    fewer = thinned(statement, options, prepared.mesh, outcome.extremal.parameters, COARSE)
+    if fewer is None and not slow:
+        return prepared
+    try:
+        return ready(options=fewer or options)
+    except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the found one counts
+        return None
+
+
 def _cheaper(
     statement: Statement, coarse: Prepared, values: Array, outcome: Outcome, reporter: Progress
 ) -> Iterator[Array]:
     """Controls on the coarse mesh of minima that are cheaper there than the found one, the cheapest first; a few."""
     mesh = coarse.mesh
     own = resampled(outcome.extremal.trajectory.u, outcome.extremal.mesh, mesh)
-    base = _run(coarse, values, _excited(statement, mesh, outcome, own), _part(reporter, PATIENT))
+    base = run_from(coarse, values, excited(statement, mesh, outcome, own), part(reporter, PATIENT))
     if base is None or not base[0].converged:
         return
     seen: list[Merit] = []
@@ -124,11 +149,11 @@ def _cheaper(
     for controls in _swings(statement, mesh, outcome):
         if reporter.stop:
             return
-        trajectory = _excited(statement, mesh, outcome, controls)
+        trajectory = excited(statement, mesh, outcome, controls)
         merit = merit_of(coarse, values, trajectory)
         if np.isfinite(merit).all() and not any(alike(merit, other, abs(merit.cost)) for other in seen):
             seen.append(merit)
-            run = _run(coarse, values, trajectory, _part(reporter, MOST_ITERATIONS))
+            run = run_from(coarse, values, trajectory, part(reporter, MOST_ITERATIONS))
             found += [] if run is None or not run[0].converged else [run[0]]
     least = cost_of(base[0]) - WORTH * abs(cost_of(base[0]))
     better = sorted((one for one in found if cost_of(one) < least), key=cost_of)
@@ -152,14 +177,16 @@ def _swings(statement: Statement, mesh: Mesh, outcome: Outcome) -> Iterator[Arra
         yield np.clip(middle + size * np.stack(waves, axis=1), *statement.control_bounds)
 
 
-def _excited(statement: Statement, mesh: Mesh, outcome: Outcome, u: Array) -> Trajectory:
+def excited(statement: Statement, mesh: Mesh, outcome: Outcome, u: Array) -> Trajectory:
     """The trajectory of some controls from where the found one begins."""
     extremal = outcome.extremal
     begin, duration = extremal.trajectory.x[0], extremal.trajectory.duration
     return completed(statement, mesh, extremal.parameters, u, start=begin, duration=duration)
 
 
-def _run(prepared: Prepared, values: Array, trajectory: Trajectory, reporter: Progress) -> tuple[Outcome, Guess] | None:
+def run_from(
+    prepared: Prepared, values: Array, trajectory: Trajectory, reporter: Progress
+) -> tuple[Outcome, Guess] | None:
     """What is found from a trajectory, and the start; None where the model has no values there."""
     start = Guess(trajectory=trajectory)
     try:
@@ -168,6 +195,6 @@ def _run(prepared: Prepared, values: Array, trajectory: Trajectory, reporter: Pr
         return None
 
 
-def _part(reporter: Progress, iterations: int) -> Progress:
+def part(reporter: Progress, iterations: int) -> Progress:
     """A part of what is reported, of so many iterations."""
     return Progress("", show=False, iterations=iterations, within=reporter)

@@ -44,7 +44,7 @@ FURTHER = 3.0
 CHEAPER = 1e-9
 
 # Among the counts of a run what is told of several starts.
-OF_STARTS = ("starts", "asked", "excited")
+OF_STARTS = ("starts", "asked", "excited", "left_duration")
 # What is looked for.
 SADDLE, TURNS = "the run ended at a saddle", "angles turn full circle between its nodes"
 

@@ -46,6 +46,7 @@ from covocp.solving.longer import from_longer
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
+from covocp.solving.other_durations import of_other_duration
 from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.other_starts import Falling, OtherStarts
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
@@ -327,7 +328,8 @@ class Solver(OtherStarts):
             taken = self._own if self._by_ipopt else {}
             coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **taken)
             run = (self._prepared, self._solved, self._options, coarse)
-            outcome, start = otherwise_excited((outcome, start), *run, guess, reporter, self._by == "gradient")
+            for compared in (of_other_duration, otherwise_excited):
+                outcome, start = compared((outcome, start), *run, guess, reporter, self._by == "gradient")
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(

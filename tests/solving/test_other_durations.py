@@ -1,0 +1,107 @@
+"""A free duration in which something is learnt: minima of other durations are compared."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import covocp as co
+
+WEIGHT, SPRING, VARIANCE, DENSITY = 7.5, 2.0, 0.39, 0.4
+INTERVALS = 60
+
+
+def oscillator(duration: float | co.Free, start: float = -0.83) -> co.Problem:
+    """x'' = -k x - x'/5 + u with unknown k, |u| <= 2: time and energy are paid, and the variance of k at the end."""
+    problem = co.Problem(duration, name="oscillator")
+    x = problem.state("x", initial=start, variance=0.1)
+    v = problem.state("v", initial=0.0, variance=0.1)
+    k = problem.unknown("k", mean=SPRING, variance=VARIANCE)
+    u = problem.control("u", lower=-2.0, upper=2.0)
+    problem.dynamics(x, v)
+    problem.dynamics(v, -k * x - 0.2 * v + u, noise=0.05)
+    problem.measurement("y", x, noise=DENSITY)
+    E = problem.estimation_covariance()
+    problem.minimize(running=0.05 + 0.2 * u**2, terminal=WEIGHT * E[k, k])
+    return problem
+
+
+def cost_by_scipy(solution: co.Solution, start: float = -0.83) -> float:
+    """What the controls found cost, integrated by scipy."""
+    times, controls = solution.t, solution["u"]
+
+    def rates(t: float, z: np.ndarray) -> np.ndarray:
+        x, v, E = z[0], z[1], z[2:11].reshape(3, 3)
+        u = np.interp(t, times, controls)
+        F = np.array([[0, 1, 0], [-SPRING, -0.2, -x], [0, 0, 0]])
+        change = F @ E + E @ F.T + np.diag([0, 0.05, 0]) - np.outer(E[:, 0], E[0]) / DENSITY
+        return np.concatenate([[v, -SPRING * x - 0.2 * v + u], change.ravel(), [0.05 + 0.2 * u**2]])
+
+    begin = np.concatenate([[start, 0.0], np.diag([0.1, 0.1, VARIANCE]).ravel(), [0.0]])
+    found = solve_ivp(rates, (0.0, times[-1]), begin, rtol=1e-9, atol=1e-12, max_step=0.1)
+    return float(WEIGHT * found.y[10, -1] + found.y[11, -1])
+
+
+@pytest.fixture(scope="module")
+def least() -> float:
+    """The least cost of all fixed durations, each solved by itself."""
+    durations = np.arange(2.0, 14.0, 0.5)
+    return min(co.solve(oscillator(float(T)), intervals=INTERVALS, progress=False).cost for T in durations)
+
+
+@pytest.mark.parametrize("guess", [2.0, 3.0, 12.0, 30.0])
+def test_no_fixed_duration_is_cheaper(guess: float, least: float) -> None:
+    found = co.solve(oscillator(co.Free(guess, 0.2, 60.0)), intervals=INTERVALS, progress=False)
+    assert found.cost <= least * 1.001
+    assert cost_by_scipy(found) == pytest.approx(found.cost, rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["auto", "reduced"])
+def test_other_methods_are_led_there_too(method: str, least: float) -> None:
+    assert (
+        co.solve(oscillator(co.Free(3.0, 0.2, 60.0)), method, intervals=INTERVALS, progress=False).cost <= least * 1.001
+    )
+
+
+def test_the_printout_says_what_was_left_and_limits_and_guesses_are_kept() -> None:
+    solver = co.Solver(oscillator(co.Free(3.0, 0.2, 60.0)), intervals=INTERVALS)
+    found = solver.solve(progress=False)
+    left = found.stats["left_duration"]
+    assert left < found.duration
+    assert f"a duration of {left:.3g} s" in " ".join(str(found).split())
+    guess = {"u": np.full(11, 0.5)}
+    for given in ({"iteration_limit": 500}, {"time_limit": 100.0}, {"guess": guess}, {"guess": found}):
+        assert "left_duration" not in solver.solve(progress=False, **given).stats, given  # type: ignore[arg-type]
+    alone = solver.solve(progress=False, assess=False)
+    assert alone.cost > 1.05 * found.cost
+    assert alone.duration == pytest.approx(left, rel=1e-3)
+
+
+def test_limits_of_the_duration_are_kept() -> None:
+    found = co.solve(oscillator(co.Free(3.0, 2.0, 4.5)), intervals=INTERVALS, progress=False)
+    assert 2.0 - 1e-6 <= found.duration <= 4.5 + 1e-6
+    fixed = [
+        co.solve(oscillator(float(T)), intervals=INTERVALS, progress=False).cost for T in np.arange(2.0, 4.6, 0.25)
+    ]
+    assert found.cost <= min(fixed) * 1.001
+
+
+def test_a_vehicle_turns_to_the_better_side_of_its_beacon() -> None:
+    """From these guesses it ended at two minima, the dearer one 2.8 times the other."""
+    costs = []
+    for guess in (4.0, 10.0):
+        problem = co.Problem(co.Free(guess, 0.2, 60.0))
+        x, y = (problem.state(name, initial=0.0, variance=0.2) for name in "xy")
+        heading = problem.state("heading", initial=0.1338)
+        speed = problem.unknown("speed", mean=1.0, variance=0.2008)
+        turn = problem.control("turn", lower=-1.0, upper=1.0)
+        problem.dynamics(x, speed * ca.cos(heading), noise=0.01)
+        problem.dynamics(y, speed * ca.sin(heading), noise=0.01)
+        problem.dynamics(heading, turn)
+        problem.measurement("range", ca.sqrt((x - 1.376) ** 2 + (y + 0.9115) ** 2 + 0.1), noise=0.0175)
+        E = problem.estimation_covariance()
+        problem.minimize(running=0.02 + 0.05 * turn**2, terminal=E[x, x] + E[y, y] + 1.051 * E[speed, speed])
+        costs.append(co.solve(problem, intervals=INTERVALS, progress=False).cost)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-6)
