@@ -101,12 +101,12 @@ def _cheapest(
         return None
     best = first = base[0]
     tried = [first.extremal.trajectory.duration]
-    middle, factors = [*tried, statement.duration.guess], FAR
+    middle, near = [*tried, statement.duration.guess], False
     sure = SURE if _within(statement, tried[0]) else 0
     runs = back = 0
     for _ in range(ROUNDS):
         before = best
-        for duration in _others(statement, middle, factors, tried):
+        for duration in _others(statement, middle, NEAR if near else FAR, tried):
             if reporter.stop:
                 return None
             tried.append(duration)
@@ -118,9 +118,9 @@ def _cheapest(
             runs += 1
             if back == runs == sure:
                 return None
-        if best is before and factors is NEAR:
+        if best is before and near:
             break
-        middle, factors = [best.extremal.trajectory.duration], NEAR if best is before else FAR
+        middle, near = [best.extremal.trajectory.duration], best is before
     return None if best is first else best
 
 

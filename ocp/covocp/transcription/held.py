@@ -143,8 +143,8 @@ def _by_controls(statement: Statement) -> ca.Function:
     return ca.Function("by_controls", symbols, [ca.densify(ca.jacobian(rate, symbols[1]))])
 
 
-def preferred(run: Run, u: Array, e: Array, free: Array) -> Array | None:
-    """Where the cost prefers some states to be, each by itself, from the start of a run on; where they are otherwise.
+def preferred(run: Run, u: Array, e: Array, free: Array) -> Array:
+    """Where the cost prefers some states to be, each by itself, from the start of a run on; NaN where it prefers none.
 
     By second differences of the running cost at some times, in the mean over all of the time, and of the terminal one;
     the slope must be about nothing there: a cost that falls on and on prefers no place.
@@ -156,9 +156,9 @@ def preferred(run: Run, u: Array, e: Array, free: Array) -> Array | None:
         free: which states may be elsewhere, (nx,).
 
     Returns:
-        None where the cost prefers no place at all.
+        Places, (nx,).
     """
-    rows = np.flatnonzero(free)
+    rows, places = np.flatnonzero(free), np.full(run.start.size, np.nan)
     cost, bend, slope = _differences(run, run.start, rows, u, e)
     with np.errstate(all="ignore"):
         seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
@@ -170,10 +170,8 @@ def preferred(run: Run, u: Array, e: Array, free: Array) -> Array | None:
     after = _differences(run, goal, rows, u, e)[2]
     with np.errstate(all="ignore"):
         seen &= np.abs(after) <= np.maximum(SETTLED * np.abs(slope), DIFFERENCE * bend)
-    if not seen.any():
-        return None
-    goal[rows] = np.where(seen, goal[rows], run.start[rows])
-    return goal
+    places[rows] = np.where(seen, goal[rows], np.nan)
+    return places
 
 
 def _differences(run: Run, x: Array, rows: Any, u: Array, e: Array) -> tuple[Array, Array, Array]:

@@ -16,6 +16,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, is_plain
+from covocp.transcription.led import led
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.mirrored import other_sides
 from covocp.transcription.path_rows import bulges, course, curved_rows
@@ -47,7 +48,8 @@ SHARES, KEPT_BEND = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), 1 / 16
 def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool = False) -> Iterator[First]:
     """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
 
-    Before them come the ways round what they run through, the cheapest first: rivals of what comes of the others.
+    Before them come the ways round what they run through, the cheapest first, and a start that is led where a loop
+    shall be: rivals of what comes of the others.
     `linked`: one of several phases.
 
     Raises:
@@ -56,7 +58,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool 
     own = own_start(statement, mesh, parameters)
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
-        yield from _ways(statement, mesh, parameters, own, []) if free else []
+        yield from _rivals(statement, mesh, parameters, own, [], linked=linked) if free else []
         yield replace(own, sides=other_sides(statement, mesh, parameters, own, linked=linked)) if free else own
         if own.held:
             yield own_start(statement, mesh, parameters, hold=False)
@@ -64,7 +66,7 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool 
             yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
         return
     found = list(_others(statement, mesh, parameters, own.trajectory))
-    yield from _ways(statement, mesh, parameters, own, [first.trajectory for first in found])
+    yield from _rivals(statement, mesh, parameters, own, [first.trajectory for first in found], linked=linked)
     yield from found or [own]
 
 
@@ -89,6 +91,15 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
     for entry in best:
         u = run.clip(resampled(unsymmetric(run, entry.u, flat), coarse, mesh))
         yield First(trajectory=completed(statement, mesh, parameters, u), plain=False)
+
+
+def _rivals(
+    statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory], *, linked: bool
+) -> list[First]:
+    """Starts of which what comes of them is compared; a loop that is one of several phases is not led."""
+    straight = None if linked else led(statement, mesh, parameters, own)
+    found = [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True)]
+    return [*_ways(statement, mesh, parameters, own, others), *found]
 
 
 def _ways(statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory]) -> list[First]:

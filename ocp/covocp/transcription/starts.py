@@ -148,7 +148,7 @@ def _own_start(statement: Statement, mesh: Mesh, values: tuple[float, ...], hold
     if run is None:
         return First(trajectory=left, plain=plain, unbent=unbent)
     kept = completed(statement, mesh, parameters, run.u.copy(), x=run.x.copy())
-    if too_dear(_told_run(statement, mesh, parameters, start), kept, left):
+    if too_dear(told_run(statement, mesh, parameters, start), kept, left):
         return First(trajectory=left, plain=plain, unbent=unbent)
     return First(trajectory=kept, plain=True, held=True)
 
@@ -225,12 +225,12 @@ def completed(
 
 def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
     """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give."""
-    run = _told_run(statement, mesh, parameters, start)
+    run = told_run(statement, mesh, parameters, start)
     travelled = np.abs(run.states(flat)).max(axis=0)
     return replace(run, scale=np.where(np.isfinite(travelled), np.maximum(run.scale, travelled), run.scale))
 
 
-def _told_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array) -> Run:
+def told_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array) -> Run:
     """The run of the nominal on a mesh, in the scales that boundary values and bounds give.
 
     Bounds that are far away say little: they count up to so many times what something else tells.
@@ -269,17 +269,13 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     parameters = np.array(values)
     flat, bent = (controls_guess(statement, mesh.nodes, mesh.control, sign=sign) for sign in (0.0, 1.0))
     start, e0 = beside_guesses(statement, mesh, parameters)
-    run, target = _told_run(statement, mesh, parameters, start), statement.boundary_values(parameters)[1]
+    run, target = told_run(statement, mesh, parameters, start), statement.boundary_values(parameters)[1]
     if aim(run, start[None, :], flat[0], e0, target) is None:
         return None
-    free = np.isnan(target)
-    for block in statement.states:
-        free[block.span] &= block.role == "moving" and not block.tangent
-    wanted = preferred(run, flat[0], e0, free)
-    if wanted is None and not guesses and np.isnan(target[statement.moving or slice(None)]).all():
+    end = wanted_end(run, flat[0], e0)
+    if not guesses and np.isnan(end[statement.moving or slice(None)]).all():
         return None  # nothing says where it shall be
-    end = np.where(np.isnan(target), start if wanted is None else wanted, target)
-    line = start + mesh.nodes[:, None] * (end - start)
+    line = start + mesh.nodes[:, None] * (np.where(np.isnan(end), start, end) - start)
     for block, guess in guesses:
         line[:, block.span] = evaluate_guess(block, guess, mesh.nodes)
     aimed = aim(run, line, flat[0], e0, target)
@@ -288,6 +284,21 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     run = in_moving_units(run, line, flat)
     bend = (bent - flat) * np.where(untold_controls(statement, flat), run.units, 1.0)
     return excited(run, line, aimed, flat, bend)
+
+
+def wanted_end(run: Run, u: Array, e: Array) -> Array:
+    """Where the states shall be in the end (nx,): final values, else where the cost prefers each; NaN: nothing tells.
+
+    Args:
+        run: its start, scales and parameters.
+        u: control (nu,).
+        e: half-vectors (ne,).
+    """
+    statement, target = run.statement, run.statement.boundary_values(run.parameters)[1]
+    free = np.isnan(target)
+    for block in statement.states:
+        free[block.span] &= block.role == "moving" and not block.tangent
+    return np.where(np.isnan(target), preferred(run, u, e, free), target)
 
 
 def followed_states(statement: Statement) -> tuple[int, ...]:
@@ -299,12 +310,18 @@ def followed_states(statement: Statement) -> tuple[int, ...]:
 
 def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[int, ...]) -> Array:
     """Controls along which some states follow their guesses, as far as they can."""
-    coarse = coarse_mesh(statement, mesh, tuple(parameters))
-    path = np.zeros((coarse.intervals + 1, statement.nx))
+    path = np.zeros((mesh.intervals + 1, statement.nx))
     for block in statement.states:
         guess = statement.guesses[block.name]
         if guess is not None:
-            path[:, block.span] = interpolated(evaluate_guess(block, guess, mesh.nodes), mesh.nodes, coarse.nodes)
+            path[:, block.span] = evaluate_guess(block, guess, mesh.nodes)
+    return controls_along(statement, mesh, parameters, rows, path)
+
+
+def controls_along(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[int, ...], path: Array) -> Array:
+    """Controls along which some states follow a path (N + 1, nx), as far as they can."""
+    coarse = coarse_mesh(statement, mesh, tuple(parameters))
+    path = interpolated(path, mesh.nodes, coarse.nodes)
     start = beside_guesses(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
