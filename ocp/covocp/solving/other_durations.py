@@ -31,8 +31,8 @@ FAR, NEAR = (0.5, 2.0, 0.75, 1.5, 3.0), (0.8, 1.25)
 SURE = 4
 # Share of the cost up to which two minima are the same.
 AGAIN = 1e-5
-# Two are the same up to this share.
-SAME = 0.15
+# Runs from two that differ by less than this share lead to the same; what was found ends there up to the second one.
+SAME, ENDS = 0.15, 0.05
 # Times that others are tried around the cheapest, and iterations of a run.
 ROUNDS, MOST_ITERATIONS = 6, 60
 
@@ -100,19 +100,19 @@ def _cheapest(
     if base is None or not base[0].converged:
         return None
     best = first = base[0]
-    tried = [first.extremal.trajectory.duration]
-    middle, near = [*tried, statement.duration.guess], False
-    sure = SURE if _within(statement, tried[0]) else 0
+    begun, ended = [statement.duration.guess], [first.extremal.trajectory.duration]
+    middle, near = [*ended, *begun], False
+    sure = SURE if _within(statement, ended[0]) else 0
     runs = back = 0
     for _ in range(ROUNDS):
         before = best
-        for duration in _others(statement, middle, NEAR if near else FAR, tried):
+        for duration in _others(statement, middle, NEAR if near else FAR, (begun, ended)):
             if reporter.stop:
                 return None
-            tried.append(duration)
+            begun.append(duration)
             run = _run(statement, coarse, values, duration, guess, reporter)
             if run is not None and run.converged:
-                tried.append(run.extremal.trajectory.duration)
+                ended.append(run.extremal.trajectory.duration)
                 best = run if cost_of(run) < cost_of(best) - WORTH * abs(cost_of(best)) else best
                 back += abs(cost_of(run) - cost_of(first)) <= AGAIN * abs(cost_of(first))
             runs += 1
@@ -143,11 +143,13 @@ def _run(
 
 
 def _others(
-    statement: Statement, middle: list[float], factors: tuple[float, ...], tried: list[float]
+    statement: Statement, middle: list[float], factors: tuple[float, ...], tried: tuple[list[float], list[float]]
 ) -> Iterator[float]:
-    """Durations beside some, within its limits, that are not among those that were tried [s]."""
-    for duration in middle:
-        for factor in factors:
+    """Durations beside some, within its limits, where no run began (first list) or ended (second) [s]."""
+    begun, ended = tried
+    for factor in factors:
+        for duration in middle:
             other = min(max(factor * duration, statement.duration.lower), statement.duration.upper)
-            if all(abs(other - one) > SAME * one for one in tried):
+            new = all(abs(other - one) > SAME * one for one in begun)
+            if new and all(abs(other - one) > ENDS * one for one in ended):
                 yield other

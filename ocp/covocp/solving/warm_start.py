@@ -63,9 +63,8 @@ def make_guesses(
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
         for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters, linked=linked):
-            yield Guess(
-                trajectory=first.trajectory, held=first.held, rival=first.rival, about=first.about, sides=first.sides
-            )
+            told = {name: getattr(first, name) for name in ("held", "rival", "alike", "about", "sides")}
+            yield Guess(trajectory=first.trajectory, **told)
     else:
         raise ProblemError(
             "The guess is of an unknown kind.",

@@ -98,7 +98,7 @@ def _rivals(
 ) -> list[First]:
     """Starts of which what comes of them is compared; a loop that is one of several phases is not led."""
     straight = None if linked else led(statement, mesh, parameters, own)
-    found = [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True)]
+    found = [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True, alike=True)]
     return [*_ways(statement, mesh, parameters, own, others), *found]
 
 

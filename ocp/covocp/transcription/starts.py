@@ -69,8 +69,9 @@ class First:
     """A start, whether no others are worth looking at, whether a feedback holds it, whether it is one of several ways.
 
     unbent: the controls of the problem's own start before they were bent, where they were; rival: whether what is found
-    from it is to be compared with what is found from the others; about: what that will cost, NaN where nothing tells;
-    sides: the start as it is compared with those that are bent to other sides, and these; of those that may learn more.
+    from it is to be compared with what is found from the others; alike: whether a rival has the magnitudes of the
+    problem's own start; about: what a rival will cost, NaN where nothing tells; sides: the start as it is compared with
+    those that are bent to other sides, and these; of those that may learn more.
     """
 
     trajectory: Trajectory
@@ -78,6 +79,7 @@ class First:
     held: bool = False
     unbent: Array | None = None
     rival: bool = False
+    alike: bool = False
     about: float = np.nan
     sides: tuple[Trajectory, ...] = ()
 
