@@ -67,7 +67,8 @@ def expected_cost(solution: co.Solution) -> float:
 def test_the_cheaper_minimum_is_found_and_costs_what_scipy_finds() -> None:
     solver = co.Solver(van_der_pol())
     found = solver.solve(progress=False)
-    swinging = solver.solve(guess={"u": np.zeros(11)}, progress=False, assess=False)
+    path = np.array([1.46, 0.9, 0.35, -0.17, -0.78, -0.98])
+    swinging = solver.solve(guess={"x": path}, progress=False, assess=False)
     assert found.stats["tried"] == 2
     assert found.cost < 0.75 * swinging.cost
     for one in (found, swinging):
