@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import Buffered
+from covocp.base.buffered import Buffered, release_large
 from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
 from covocp.passage.sweep import make_room
@@ -56,6 +56,7 @@ class AtPoint:
     def rest(self) -> None:
         """Before and after many calls: where they take much memory, nothing is kept beside it."""
         if self._full.large:
+            release_large()
             make_room()
 
     def full(self, w: Array, p: Array) -> Outputs | None:

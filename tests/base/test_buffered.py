@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from side_by_side import in_threads
 
+from covocp.base import buffered
 from covocp.base.buffered import Buffered, Matrices, swept
 
 
@@ -74,3 +75,24 @@ def test_threads_share_matrices():
 
     in_threads(run)
     assert not wrong
+
+
+def test_of_large_functions_one_has_memory(monkeypatch):
+    """That which was called last, until another one is or it is given back; the numbers are those of small ones."""
+    x = ca.MX.sym("x", 3)
+    functions = [ca.Function(f"f{k}", [x], [k * x + 1.0, ca.sum1(x) ** k]) for k in (1, 2)]
+    small = [Buffered(function) for function in functions]
+    monkeypatch.setattr(buffered, "MOST_KEPT", 0)
+    large = [Buffered(function) for function in functions]
+    matrices = Matrices(functions[0])
+    for k in (0, 0, 1, 0):
+        for point in (np.arange(3.0), np.array([0.5, -2.0, 1e9])):
+            for own, other in zip(large[k](point), small[k](point), strict=True):
+                np.testing.assert_array_equal(own, other)
+        assert [one._kept is not None for one in large] == [k == 0, k == 1]
+    matrices.evaluated(np.ones(3))
+    assert [one._kept for one in (*large, matrices)] == [None] * 3
+    large[1](np.ones(3))
+    del large[1]
+    buffered.release_large()
+    np.testing.assert_array_equal(large[0](np.ones(3))[0], np.full(3, 2.0))

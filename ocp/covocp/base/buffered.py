@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import casadi as ca
@@ -10,7 +11,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.threads import briefly
 
-# Numbers that a function works in above which they are there during a call alone: they take less time than it.
+# Numbers that a function works in above which they are there for one function at a time: that which was called last.
 MOST_KEPT = 1_000_000
 
 
@@ -26,12 +27,8 @@ class Buffered:
         self._function = function
         self._arguments = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self._results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-        self._kept = self._memory() if function.sz_w() <= MOST_KEPT else None
-
-    @property
-    def large(self) -> bool:
-        """Whether it takes memory anew for each call."""
-        return self._kept is None
+        self.large = function.sz_w() > MOST_KEPT
+        self._kept = None if self.large else self._memory()
 
     def _memory(self) -> tuple[Any, Any]:
         """What CasADi works in, and the call."""
@@ -47,7 +44,11 @@ class Buffered:
         """The nonzero entries of the outputs, copied; None where the function fails."""
         for memory, argument in zip(self._arguments, arguments, strict=True):
             memory[:] = argument
-        buffer, run = self._kept or self._memory()
+        if self._kept is None:
+            release_large()
+            self._kept = self._memory()
+            _LARGE.append(weakref.ref(self))
+        buffer, run = self._kept
         try:
             run()
         except RuntimeError:
@@ -55,6 +56,18 @@ class Buffered:
         if buffer.ret():
             return None
         return tuple(result.copy() for result in self._results)
+
+
+# The one of those which are large that has memory.
+_LARGE: list[weakref.ref[Buffered]] = []
+
+
+def release_large() -> None:
+    """Give back what the large function that was called last works in, before another one does or after many calls."""
+    while _LARGE:
+        last = _LARGE.pop()()
+        if last is not None:
+            last._kept = None
 
 
 class Matrices(Buffered):
@@ -80,6 +93,8 @@ class Matrices(Buffered):
             RuntimeError: the function fails.
         """
         outputs = self(*(np.asarray(argument).ravel(order="F") for argument in arguments))
+        if self.large:  # as a rule it is asked once
+            release_large()
         if outputs is None:
             raise RuntimeError(f"{self._function.name()} failed")
         return [values.reshape(shape, order="F") for values, shape in zip(outputs, self._shapes, strict=True)]
