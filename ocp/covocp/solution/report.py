@@ -418,7 +418,7 @@ def _effort(solution: Solution) -> Section:
     if "untried" in stats and solution.within is None:
         effort.append(untried_told(stats["untried"]))
     if "left_duration" in stats:
-        effort.append(f"cheaper than what a duration of {stats['left_duration']:.3g} s was found with")
+        effort.append(f"cheaper than with a duration of {stats['left_duration']:.3g} s, where it ended first")
     if stats.get("excited"):
         effort.append("another number of switches was cheaper")
     if stats.get("left_saddle"):

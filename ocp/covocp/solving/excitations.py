@@ -20,7 +20,7 @@ from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.solving.attempts import alike, cost_of, counted, merit_of, with_stats
 from covocp.solving.coarse_start import thinned
-from covocp.solving.other_minima import CHEAPER
+from covocp.solving.other_minima import CHEAPER, OF_STARTS
 from covocp.statement.names import name_of
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import is_plain
@@ -83,7 +83,8 @@ def otherwise_excited(
             continue
         other, at = again
         if other.converged and cost_of(other) < cost_of(outcome) - CHEAPER * abs(cost_of(outcome)):
-            return with_stats(other, **counted(outcome, other), excited=True), at
+            told = {name: outcome.stats[name] for name in OF_STARTS if name in outcome.stats} | {"excited": True}
+            return with_stats(other, **counted(outcome, other), **told), at
     return found
 
 
