@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.models import mars_entry
+from covocp.transcription import ranked_starts
 
 DURATION, START, VARIANCE, DENSITY = 4.308, (1.4618, -0.3626), 0.326, 0.0549
 WEIGHTS, EFFORT = (4.54, 1.0), 0.246
@@ -122,3 +123,11 @@ def test_where_the_cost_prefers_a_state_a_pendulum_is_led() -> None:
     found = solver.solve(progress=False)
     assert found.stats["tried"] >= 2
     assert found.cost <= solver.solve(guess="multistart", progress=False, assess=False).cost * (1 + 1e-6)
+
+
+def test_a_start_that_cannot_be_made_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("the model has no value on that line")
+
+    monkeypatch.setattr(ranked_starts, "led", fails)
+    assert "tried" not in co.solve(van_der_pol((1.0, 0.0)), progress=False).stats

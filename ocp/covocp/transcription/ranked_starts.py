@@ -9,6 +9,7 @@ decides; and runs are pushed to the sides of what they run through.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -96,18 +97,17 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
 def _rivals(
     statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory], *, linked: bool
 ) -> list[First]:
-    """Starts of which what comes of them is compared; a loop that is one of several phases is not led."""
-    straight = None if linked else led(statement, mesh, parameters, own)
-    found = [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True, alike=True)]
-    return [*_ways(statement, mesh, parameters, own, others), *found]
+    """Starts of which what comes of them is compared; a loop that is one of several phases is not led.
 
-
-def _ways(statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory]) -> list[First]:
-    """See `_ways_round`; none where a number of the search has no value: the other starts are as good without it."""
-    try:
-        return list(_ways_round(statement, mesh, parameters, own, others))
-    except (np.linalg.LinAlgError, RuntimeError):  # what CasADi raises is a RuntimeError
-        return []
+    None where a number of the search has no value: the other starts are as good without it.
+    """
+    found: list[First] = []
+    with suppress(np.linalg.LinAlgError, RuntimeError):  # what CasADi raises is a RuntimeError
+        found += list(_ways_round(statement, mesh, parameters, own, others))
+    with suppress(np.linalg.LinAlgError, RuntimeError):
+        straight = None if linked else led(statement, mesh, parameters, own)
+        found += [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True, alike=True)]
+    return found
 
 
 def _ways_round(
