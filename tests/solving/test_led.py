@@ -32,7 +32,7 @@ def van_der_pol(start: tuple[float, float] = START) -> co.Problem:
 
 
 def expected_cost(solution: co.Solution) -> float:
-    """Of the nominal found, by scipy: E forward, S backward; int L + int tr(B C Ehat...) as tr S E and its noises."""
+    """Of the nominal found, by scipy: E forward, S backward; int L + tr(S E)/2 at 0 + int tr(S Q + B C E C')/2."""
     times, controls = solution.t, solution["u"]
     Q, A = np.diag([0.0, 0.02, 0.0]), np.diag([1.0, 1.0, 0.0])
     G = np.array([[0.0], [1.0], [0.0]])

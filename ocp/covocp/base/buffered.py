@@ -16,7 +16,11 @@ MOST_KEPT = 1_000_000
 
 
 class Buffered:
-    """A function of dense arguments, with memory of its own; not for two threads at a time."""
+    """A function of dense arguments, with memory of its own; not for two threads at a time.
+
+    Attributes:
+        large: whether it has memory only as long as no other large one is called.
+    """
 
     def __init__(self, function: ca.Function) -> None:
         """Make the memory.

@@ -30,6 +30,7 @@ from covocp.solving.attempts import best_of, counted, from_starts, interrupted, 
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
+from covocp.solving.coarse_search import Search
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -327,9 +328,10 @@ class Solver(OtherStarts):
         if assess and first is None and not self._counted:
             taken = self._own if self._by_ipopt else {}
             coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **taken)
-            run = (self._prepared, self._solved, self._options, coarse)
-            for compared in (of_other_duration, otherwise_excited):
-                outcome, start = compared((outcome, start), *run, guess, reporter, self._by == "gradient")
+            here = partial(Search, prepared=self._prepared, statement=self._solved, options=self._options, ready=coarse)
+            search = here(guess=guess, reporter=reporter, slow=self._by == "gradient")
+            for looked in (of_other_duration, otherwise_excited):
+                outcome, start = looked(search, (outcome, start))
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(

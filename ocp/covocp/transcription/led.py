@@ -21,7 +21,7 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.starts import First, beside_guesses, completed, controls_along, told_run, wanted_end
 from covocp.transcription.trajectory import Trajectory
 
-# A run goes past where it shall be by more than this share of the way, or of the size of the state where that is less.
+# A run goes past where a state shall be by more than this share of the way there, or of its size at the ends if more.
 PAST = 0.25
 # Statements that are kept.
 KEPT = 16
@@ -57,10 +57,10 @@ def led(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> Traj
 
 
 def _runs_past(x: Array, start: Array, end: Array) -> bool:
-    """Whether some of the states leave what lies between both ends by more than a share of it, or of their size."""
+    """Whether some of the states (nodes, n) leave what lies between both ends (n,); those at zero there have no way."""
     past = np.maximum(np.minimum(start, end) - x, x - np.maximum(start, end)).max(axis=0)
     size = np.maximum(np.abs(end - start), np.maximum(np.abs(start), np.abs(end)))
-    return bool((past > PAST * size).any())
+    return bool(((past > PAST * size) & (size > 0.0)).any())
 
 
 @lru_cache(maxsize=KEPT)
