@@ -17,6 +17,7 @@ from covocp.base.buffered import Matrices, swept
 from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, read_only
 from covocp.base.quadrature import classical_step, hermite
+from covocp.extremal.along_nodes import along_nodes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, state_slope
@@ -189,6 +190,10 @@ def without_passage(extremal: Extremal) -> Extremal:
 def _through_passages(extremal: Extremal, weights: Array) -> tuple[Array, ...]:
     """What `passage_slopes` gives along an extremal for weights of the half-vectors (N + 1, ne), the node first."""
     t = extremal.trajectory
+    along = along_nodes(extremal.statement, extremal.mesh, t, extremal.parameters)
+    if along is not None:
+        found = along.slopes(weights)
+        return found.x, found.u, np.array(found.duration), found.kicks
     given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T, np.zeros_like(weights.T))
     return tuple(v.T for v in passage_slopes(extremal.statement, extremal.mesh).evaluated(*given))
 

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.buffered import Buffered, Matrices
+from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
@@ -30,7 +30,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.free_starts import free_start, largest, start_weights
 from covocp.extremal.hamiltonian import Costates
-from covocp.extremal.lagrangian import arguments, held_rows, node_size, second_order, slopes_of_intervals
+from covocp.extremal.lagrangian import arguments, held_rows, node_size, product_along, second_order, slopes_of_intervals
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
 
@@ -284,10 +284,9 @@ class _Reduced:
         if not tangents.size:
             return None
         between = _between(extremal, fine)
-        given = arguments(fine, _costates(fine, through=tangents.gain is None))
-        product, jacobian = second_order(st, fine.mesh, held.entries)
-        applied = _applied(product, given)
-        once = _seconds(applied, product.size1_in(product.n_in() - 1))
+        costates = _costates(fine, through=tangents.gain is None)
+        applied, jacobian, given = product_along(fine, costates, held.entries)
+        once = _seconds(applied, node_size(st) * (fine.mesh.intervals + 1) + fine.trajectory.u.size)
         if once * (LEAST_STEPS + _for_units(st.nu, tangents.start)) > seconds:
             raise _TooLongError
         moving = np.flatnonzero(tangents.free).tolist()
@@ -349,17 +348,6 @@ class _Reduced:
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
         return null_space(rows, self.root.shape[0])
-
-
-def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], Array]:
-    """A product with a direction, its other arguments given: NaN where it fails."""
-    call, known = Buffered(product), [np.asarray(value, dtype=float).ravel(order="F") for value in given]
-
-    def product_with(direction: Array) -> Array:
-        outputs = call(*known, direction)
-        return np.full(direction.shape, np.nan) if outputs is None else outputs[0]
-
-    return product_with
 
 
 def _seconds(product: Callable[[Array], Array], size: int) -> float:

@@ -6,19 +6,23 @@ along the nodes (where they drive the nominal they are variables like it).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Buffered
 from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
+from covocp.extremal.along_nodes import Hessian, along_nodes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.passage.columns import in_columns
 from covocp.passage.sweep import passed_by
 from covocp.statement.conditions import Columns, Conditions, Inside
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
@@ -63,13 +67,21 @@ def _sees_matrices(statement: Statement, held: Entries) -> bool:
 
 
 @lru_cache(maxsize=4)
-def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Function, ca.Function | None]:
+def second_order(
+    statement: Statement, mesh: Mesh, held: Entries, *, alone: bool = False
+) -> tuple[ca.Function | None, ca.Function | None]:
     """The Hessian of the Lagrangian times a direction, and the Jacobian of what is held.
 
+    Args:
+        statement: the problem.
+        mesh: of it.
+        held: rows that are held.
+        alone: of what stands at the nodes alone, without intervals and matrices (`Hessian` is of these).
+
     Returns:
-        (*arguments, direction) -> the product; (*arguments) -> Jacobian of the rows held that are no states, None
-        where there are none (`held_rows` has all of them). Directions and columns: the nodes one after the other, then
-        the controls.
+        (*arguments, direction) -> the product, None where it is zero by its form; (*arguments) -> Jacobian of the rows
+        held that are no states, None where there are none (`held_rows` has all of them). Directions and columns: the
+        nodes one after the other, then the controls.
     """
     st, n = statement, mesh.intervals
     size = node_size(st)
@@ -84,22 +96,16 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     lengths = {"path": st.path.size, "states": st.nx, "matrices": st.ne}
     path, states, matrices = (ca.MX.sym(name, length, n + 1) for name, length in lengths.items())
     none = ca.MX.sym("none", 2)
-    common = interval_columns(mesh, u, duration, p)
     x = z[: st.nx, :]
-    if st.coupled:
-        ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
-        e = seen = z[st.nx :, :]
+    if alone:
+        e = seen = ca.MX(st.ne, n + 1)
+        value = ca.MX(0.0)
     else:
-        advance = in_columns(st, nominal_interval(st, mesh.substeps, mesh.step), n)
-        ends, fine, cost = advance(z[:, :-1], *common)
-        e = seen = ca.MX(0, n + 1)
-        if st.matrices:
-            passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1] + none[0])
-            e, matrix_cost = matrices_along(*passing, passage=passed_by)
-            seen = matrices_along(*passing)[0] if compiled_steps(mesh) and _sees_matrices(st, held) else e
-            cost += matrix_cost
-    value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])
-    value += ca.dot(final, x[:, -1]) + ca.dot(final_e, e[:, -1]) + ca.dot(states, x) + ca.dot(matrices, e)
+        common = interval_columns(mesh, u, duration, p)
+        e, seen, cost, ends = _passed(st, mesh, held, (z, e0, duration, p, none), common)
+        value = ca.sum2(cost) + ca.dot(costate[:, 1:], ends - z[:, 1:])
+        value += ca.dot(final_e, e[:, -1]) + ca.dot(matrices, e)
+    value += st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(final, x[:, -1]) + ca.dot(states, x)
     rows = {"final_matrices": seen[:, -1], "matrices": seen}
     at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1])
     time = duration * ca.DM(mesh.nodes).T
@@ -122,13 +128,123 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     rows["instants"] = ca.vertcat(ca.MX(0, 1), *own_rows)
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions and kind not in OF_STATES]
     inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices, none]
-    direction = ca.MX.sym("direction", w.shape[0])
-    gradient = ca.gradient((1 + none[0]) * value, w)
-    product = ca.densify(ca.forward([gradient], [w, none], [[direction, ca.repmat(none[1], 2, 1)]])[0][0])
-    function = ca.Function("product", [*inputs, direction], [product])
+    function = None
+    if not alone or _curved(st):
+        direction = ca.MX.sym("direction", w.shape[0])
+        gradient = ca.gradient((1 + none[0]) * value, w)
+        product = ca.densify(ca.forward([gradient], [w, none], [[direction, ca.repmat(none[1], 2, 1)]])[0][0])
+        function = ca.Function("product", [*inputs, direction], [product])
     if not kept:
         return function, None
     return function, ca.Function("held", inputs, [ca.jacobian(ca.vertcat(*kept), w)])
+
+
+def _passed(
+    statement: Statement, mesh: Mesh, held: Entries, at: tuple[Any, ...], common: Interval
+) -> tuple[Any, Any, Any, Any]:
+    """Half-vectors at the nodes, the same for rows that are held, running costs, and the nodes after the intervals."""
+    st, n, (z, e0, duration, p, none) = statement, mesh.intervals, at
+    if st.coupled:
+        ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
+        return z[st.nx :, :], z[st.nx :, :], cost, ends
+    x = z[: st.nx, :]
+    advance = in_columns(st, nominal_interval(st, mesh.substeps, mesh.step), n)
+    ends, fine, cost = advance(z[:, :-1], *common)
+    e = seen = ca.MX(0, n + 1)
+    if st.matrices:
+        passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1] + none[0])
+        e, matrix_cost = matrices_along(*passing, passage=passed_by)
+        seen = matrices_along(*passing)[0] if compiled_steps(mesh) and _sees_matrices(st, held) else e
+        cost = cost + matrix_cost
+    return e, seen, cost, ends
+
+
+def _curved(statement: Statement) -> bool:
+    """Whether anything that stands at the nodes may have second derivatives by states and controls."""
+    st = statement
+    if st.path.size or st.start.size or st.end.size or st.inside.size:
+        return True
+    symbols = [st.symbolic.sym(name, st.terminal.size1_in(i)) for i, name in enumerate("xeTp")]
+    return bool(ca.depends_on(ca.gradient(st.terminal(*symbols), symbols[0]), symbols[0]))
+
+
+@lru_cache(maxsize=4)
+def terminal_weights(statement: Statement) -> ca.Function | None:
+    """(T, parameters) -> slopes of the terminal cost by the half-vectors; None where they depend on anything else."""
+    st = statement
+    symbols = [st.symbolic.sym(name, st.terminal.size1_in(i)) for i, name in enumerate("xeTp")]
+    slope = ca.gradient(st.terminal(*symbols), symbols[1])
+    if ca.depends_on(slope, ca.vertcat(*symbols[:2])):
+        return None
+    return ca.Function("terminal_weights", symbols[2:], [ca.densify(slope)])
+
+
+def product_along(
+    extremal: Extremal, costates: Costates, held: Entries
+) -> tuple[Callable[[Array], Array], ca.Function | None, tuple[Any, ...]]:
+    """The Hessian of the Lagrangian along an extremal, times a direction.
+
+    Args:
+        extremal: along which.
+        costates: at its nodes.
+        held: rows that are held.
+
+    Returns:
+        Direction -> the product, NaN where it fails; the Jacobian that `second_order` gives, and its arguments.
+    """
+    st, given, numbers = extremal.statement, arguments(extremal, costates), _hessian(extremal, costates, held)
+    product, jacobian = second_order(st, extremal.mesh, held, alone=numbers is not None)
+    if numbers is None:
+        assert product is not None
+        return _applied(product, given), jacobian, given
+    others = None if product is None else _applied(product, given)
+    shape, split = extremal.trajectory.u.shape, extremal.trajectory.x.size
+
+    def product_with(direction: Array) -> Array:
+        by_x, by_u = numbers(direction[:split].reshape(-1, st.nx), direction[split:].reshape(shape))
+        found = np.concatenate([by_x.ravel(), by_u.ravel()])
+        return found if others is None else found + others(direction)
+
+    return product_with, jacobian, given
+
+
+def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], Array]:
+    """A product with a direction, its other arguments given: NaN where it fails."""
+    call, known = Buffered(product), [np.asarray(value, dtype=float).ravel(order="F") for value in given]
+
+    def product_with(direction: Array) -> Array:
+        outputs = call(*known, direction)
+        return np.full(direction.shape, np.nan) if outputs is None else outputs[0]
+
+    return product_with
+
+
+def _hessian(extremal: Extremal, costates: Costates, held: Entries) -> Hessian | None:
+    """The part of the Hessian of the Lagrangian that `second_order` leaves out where it stands alone.
+
+    Args:
+        extremal: along which.
+        costates: at its nodes.
+        held: rows that are held.
+
+    Returns:
+        None where the library cannot take it, or where it is no weighed sum of the half-vectors: not by itself.
+    """
+    st, m = extremal.statement, extremal.multipliers
+    conditions: list[Conditions | Inside] = [st.path, st.start, st.end, st.inside]
+    seen = any(kind.uses_matrices for kind in conditions if kind.size) or _sees_matrices(st, held)
+    if seen or st.behind or st.tied is not None:
+        return None
+    weights, along = m.matrices.copy(), along_nodes(st, extremal.mesh, extremal.trajectory, extremal.parameters)
+    if along is None:
+        return None
+    if st.ne:
+        slopes = terminal_weights(st)
+        if slopes is None:
+            return None
+        by_terminal = slopes(extremal.trajectory.duration, extremal.parameters)
+        weights[-1] += m.final_matrices + np.asarray(by_terminal.full()).ravel()
+    return Hessian(along, weights, costates.state[1:])
 
 
 def held_rows(jacobian: ca.Function | None, held: Entries, extremal: Extremal, given: tuple[Any, ...]) -> Array:

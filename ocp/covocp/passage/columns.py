@@ -118,6 +118,29 @@ def numbers_in_columns(owner: Owner, function: ca.Function, columns: Sequence[Ar
     return told.of_numbers(columns, columns[0].shape[1])
 
 
+def derivative_in_columns(owner: Owner, function: ca.Function, *kinds: str) -> OnColumns | None:
+    """A derivative of a function along one direction, for numbers, as nodes of `in_columns` have it.
+
+    Args:
+        owner: as of `in_columns`.
+        function: of dense arguments, one column each.
+        kinds: "forward" or "reverse", and of what comes of that again.
+
+    Returns:
+        The derivative, with the arguments and results that CasADi gives it; None where compiled code cannot take it, or
+        where something is sparse.
+    """
+    told = _KEPT.setdefault(owner, _Kept()).told(function)
+    moving = [function.is_diff_in(i) for i in range(function.n_in())]
+    for kind in kinds:
+        if told is None:
+            return None
+        ends = told.outputs if kind == "reverse" else told.inputs
+        told, results = told.derived(kind, tuple(moving)), [True] * len(told.outputs)
+        moving = [*moving, *results, *([True] * len(ends))]
+    return told if told is not None and told.whole else None
+
+
 class _Kept:
     """What is kept of one owner: nodes, and functions as the library is told of them."""
 
@@ -244,6 +267,15 @@ class OnColumns:
             raise MemoryError
         return found
 
+    def prepared(self, given: Sequence[Array | None], count: int) -> Prepared:
+        """Its evaluation on dense arguments that stay where they are, so many columns (rows, count) in Fortran's order.
+
+        Args:
+            given: of each argument; None: zeros.
+            count: columns.
+        """
+        return Prepared(self, given, count)
+
     def run(self, addresses: Sequence[int | None], count: int, steps: int = 1) -> int:
         """Evaluate it on so many columns, or sequences of them.
 
@@ -256,6 +288,30 @@ class OnColumns:
             0; else there was no memory.
         """
         return int(self._run(*self._told, self._places(*addresses), steps, count))
+
+
+class Prepared:
+    """A function on columns of numbers that change where they lie, evaluated again and again.
+
+    Attributes:
+        found: columns of each result; empty where a result is nothing.
+    """
+
+    def __init__(self, told: OnColumns, given: Sequence[Array | None], count: int) -> None:
+        """Make room for the results."""
+        shapes = [(shape.shape[0] if shape.nnz() else 0, shape.shape[1] * count) for shape in told.outputs]
+        self.found = [np.zeros(shape, order="F") for shape in shapes]
+        self._told, self._given, self._count = told, given, count
+        self._places = [None if array is None else array.ctypes.data for array in (*given, *self.found)]
+
+    def run(self) -> None:
+        """Evaluate it.
+
+        Raises:
+            MemoryError: there was none.
+        """
+        if self._told.run(self._places, self._count):
+            raise MemoryError
 
 
 class _Source:

@@ -145,6 +145,55 @@ def from_one(first: Array, points: Sequence[Array], size: int, pattern: Pattern,
     return result
 
 
+class Course:
+    """A passage of numbers from one start whose slopes are wanted, without a node; not for two threads at a time."""
+
+    def __init__(self, first: Array, points: Sequence[Array], size: int, pattern: Pattern, every: int) -> None:
+        """As of `from_one`."""
+        self._sweep = _sweep(size, pattern, points[0].shape[1], False, (), 0, False, every)
+        self._given = [np.asfortranarray(array, dtype=float) for array in (first, *points)]
+        self._places = (*(array.ctypes.data for array in self._given), None, None)
+        self._still = np.zeros(self._sweep.half)
+
+    def slopes(self, seeds: Array) -> tuple[Array, list[Array], Array]:
+        """Slopes of what weighs the half-vectors.
+
+        Args:
+            seeds: weights, a column for each half-vector that is wanted.
+
+        Returns:
+            Slopes by the half-vector at the start; by the entries at the first and the second point, a column for each
+            step; by what is added to the half-vectors as they pass, a column for each that is wanted.
+
+        Raises:
+            MemoryError: there was none.
+        """
+        sweep, seeds = self._sweep, np.asfortranarray(seeds, dtype=float)
+        start, kicks = np.empty(sweep.half), np.empty((sweep.half, sweep.ends), order="F")
+        points = [np.empty((sweep.entries, sweep.moves), order="F") for _ in range(2)]
+        found = (array.ctypes.data for array in (start, *points))
+        memory = _WORKSPACES.take(sweep)
+        failed = needed()["passage_reverse"](
+            memory, *self._places, seeds.ctypes.data, *found, None, kicks.ctypes.data
+        )
+        _WORKSPACES.give(sweep, memory)
+        if failed:
+            raise MemoryError(f"no memory for the slopes of {sweep.count} steps")
+        return start, points, kicks
+
+    def tangents(self, seeds: Array, moved: Sequence[Array], slopes: Sequence[Array]) -> None:
+        """Tangents of the slopes by the entries at both points, where the entries move, and the start does not.
+
+        Args:
+            seeds: as of `slopes`, in Fortran's order.
+            moved: tangents of the entries at both points, in Fortran's order.
+            slopes: where tangents of the slopes are written, likewise.
+        """
+        along = (self._still.ctypes.data, *(array.ctypes.data for array in moved))
+        places = (None, *(array.ctypes.data for array in slopes), None, None)
+        self._sweep.tangent(self._places, seeds.ctypes.data, along, None, None, places)
+
+
 def entries_of(points: Sequence[Expr], size: int) -> Entries:
     """Entries of h H of steps, from the matrices (2n, 2n) of all steps side by side, at the first and second point."""
     rows, columns = _pattern(points, size)

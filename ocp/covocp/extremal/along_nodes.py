@@ -1,0 +1,358 @@
+"""Nominal and matrices along nodes that are known, by the compiled library alone: slopes, and their tangents.
+
+Each interval is run from its own node, and the matrices pass along what that gives. Slopes, and the Hessian times a
+direction, are those that CasADi gives of the same steps: without an expression of them, which takes longer to make than
+to evaluate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.dataclass import dataclass
+from covocp.base.expressions import slopes_by
+from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
+from covocp.passage.columns import FEWEST, OnColumns, derivative_in_columns, numbers_in_columns, numbers_in_turn
+from covocp.passage.library import functions
+from covocp.passage.sweep import Course
+from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT, gauss_entries
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.numbers import by_themselves, columns_of_parts, turned
+from covocp.transcription.shooting import control_ends
+from covocp.transcription.steps import nominal_interval
+from covocp.transcription.trajectory import Trajectory
+
+# What `Interval` has behind the controls at both ends, of which slopes are taken by T alone.
+LATER, DURATION = 5, 2
+
+
+class Slopes(NamedTuple):
+    """Slopes by the states at the nodes (N + 1, nx), the control values, T; costates of the half-vectors (N + 1, ne)."""
+
+    x: Array
+    u: Array
+    duration: float
+    kicks: Array
+
+
+class Way(NamedTuple):
+    """A matrix on its way: its position, whether it runs backward, its steps in the order of travel.
+
+    function: the entries of its steps. course: it passes by them.
+    """
+
+    position: int
+    back: bool
+    steps: list[Array]
+    function: ca.Function
+    course: Course
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlongNodes:
+    """All intervals run from their nodes, and the matrices along them.
+
+    Attributes:
+        statement, mesh, parameters: what is run.
+        end: x(T), T.
+        steps: states at both ends of each substep and what `Interval` has, a column each.
+        ways: the matrices.
+    """
+
+    statement: Statement
+    mesh: Mesh
+    parameters: Array
+    end: tuple[Array, float]
+    steps: list[Array]
+    ways: tuple[Way, ...]
+
+    __repr__ = short_repr
+
+    def slopes(self, weights: Array) -> Slopes:
+        """Slopes of the running cost and of weighed half-vectors.
+
+        Args:
+            weights: of the half-vectors at the nodes, (N + 1, ne).
+        """
+        seeds = Seeds.of(self, weights)
+        found = Backward.of(self, seeds)
+        x = np.vstack([found.x, np.zeros(self.statement.nx)])
+        duration = found.duration + seeds.duration
+        if self.statement.behind:
+            last = seeds.kicks[-1, self.statement.entries(self.statement.behind)]
+            by_x, by_duration = _end_slopes(self.statement)(*self.end, self.parameters, last)
+            x[-1] += np.asarray(by_x.full()).ravel()
+            duration += float(by_duration)
+        return Slopes(x, by_controls(self.mesh, found.begin, found.end), duration, seeds.kicks)
+
+
+def along_nodes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array) -> AlongNodes | None:
+    """Run all intervals from their nodes; remembered.
+
+    Args:
+        statement: the problem.
+        mesh: of it.
+        trajectory: whose nodes they are.
+        parameters: of the statement.
+
+    Returns:
+        None where the library cannot take the model or its steps, or where running costs depend on the matrices.
+    """
+    return _along_nodes(statement, mesh, trajectory, tuple(parameters.tolist()))
+
+
+@lru_cache(maxsize=2)
+def _along_nodes(
+    statement: Statement, mesh: Mesh, trajectory: Trajectory, given: tuple[float, ...]
+) -> AlongNodes | None:
+    st, t, parameters, n, m = statement, trajectory, np.array(given), mesh.intervals, mesh.substeps
+    plain = st.nominal is not None and mesh.step != "rodas" and functions() is not None and n * m >= FEWEST
+    if not plain or st.running_uses_matrices or (st.matrices and not by_themselves(st, mesh)):
+        return None
+    columns, advance = columns_of_parts(mesh, m, t.u.T, t.duration, parameters), nominal_interval(st, 1, mesh.step)
+    found = numbers_in_turn(st, advance, t.x[:n].T, columns, m)
+    if found is None or derivative_in_columns(st, advance, "reverse") is None:
+        return None
+    before = np.empty((n, m, st.nx))
+    before[:, 0], before[:, 1:] = t.x[:n], found[0].T.reshape(n, m, -1)[:, :-1]
+    steps = [np.asfortranarray(values) for values in (before.reshape(n * m, -1).T, found[0], *columns)]
+    back = [np.asfortranarray(values) for values in turned(steps, slice(None, None, -1))] if st.behind else []
+    ways = [_way(st, mesh, i, t.e[0], steps) for i in st.ahead] + [_way(st, mesh, i, t.e[-1], back) for i in st.behind]
+    if any(way is None for way in ways):
+        return None
+    return AlongNodes(
+        statement=st,
+        mesh=mesh,
+        parameters=parameters,
+        end=(t.x[-1], t.duration),
+        steps=steps,
+        ways=tuple(way for way in ways if way is not None),
+    )
+
+
+def _way(statement: Statement, mesh: Mesh, position: int, first: Array, steps: list[Array]) -> Way | None:
+    """A matrix from its half-vector among all where it starts; None where the library cannot take its entries."""
+    (function, pattern), block = gauss_entries(statement, position, mesh.step), statement.matrices[position]
+    points = numbers_in_columns(statement, function, steps)
+    if points is None or derivative_in_columns(statement, function, "reverse") is None:
+        return None
+    course = Course(first[block.span], points, block.size, pattern, mesh.substeps)
+    return Way(position, block.backward, steps, function, course)
+
+
+@lru_cache(maxsize=KEPT)
+def _end_slopes(statement: Statement) -> ca.Function:
+    """(x(T), T, parameters, weights) -> slopes by x(T) and T of the half-vectors that start there, weighed."""
+    assert statement.matrix_end is not None
+    symbols = [ca.MX.sym("x", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)]
+    weights = ca.MX.sym("weights", len(statement.entries(statement.behind)))
+    slopes = slopes_by(ca.dot(weights, statement.matrix_end(*symbols)), symbols[:2])
+    return ca.Function("end_slopes", [*symbols, weights], slopes)
+
+
+def derived(statement: Statement, function: ca.Function, *kinds: str) -> OnColumns:
+    """A derivative that the library has."""
+    found = derivative_in_columns(statement, function, *kinds)
+    assert found is not None
+    return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seeds:
+    """Slopes of weighed half-vectors by the steps: what the way back over the nominal begins with.
+
+    Attributes:
+        before, after: by the states at both ends of each substep, (nx, N substeps).
+        begin, end: by the controls there.
+        duration: by T.
+        kicks: costates of the half-vectors, (N + 1, ne).
+        entries: of each matrix, its weights in the order of travel, and slopes by its entries at both points.
+    """
+
+    before: Array
+    after: Array
+    begin: Array
+    end: Array
+    duration: float
+    kicks: Array
+    entries: list[tuple[Array, list[Array]]]
+
+    @staticmethod
+    def of(along: AlongNodes, weights: Array) -> Seeds:
+        """Of weights of the half-vectors at the nodes, (N + 1, ne)."""
+        st, kicks, steps = along.statement, weights.copy(), along.steps
+        total, duration, entries = [np.zeros_like(values) for values in steps[:4]], 0.0, []
+        for way in along.ways:
+            own, order = st.matrices[way.position].span, slice(None, None, -1 if way.back else 1)
+            given = weights[order, own]
+            seeds = np.asfortranarray(given[1:].T)
+            start, points, passing = way.course.slopes(seeds)
+            entries.append((seeds, points))
+            kicks[order, own] = np.vstack([given[0] + start, passing.T])
+            nothing = [np.zeros(0)] * 2
+            by = derived(st, way.function, "reverse").of_numbers([*way.steps, *nothing, *points], steps[0].shape[1])
+            for result, slopes in zip(total, (1, 0, 3, 2) if way.back else range(4), strict=True):
+                result += by[slopes][:, order]
+            duration += float(by[4 + DURATION].sum())
+        before, after, begin, end = total
+        return Seeds(
+            before=before, after=after, begin=begin, end=end, duration=duration, kicks=kicks, entries=entries
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Backward:
+    """The way back over the nominal, interval by interval.
+
+    Attributes:
+        x: slopes by the states at the starts of the intervals, (N, nx).
+        begin, end: by the controls at both ends of each substep, (nu, N substeps), those of the seeds among them.
+        duration: by T.
+        seeds: slopes by the states after the first, second, ... substep of all intervals, (nx, N) each.
+    """
+
+    x: Array
+    begin: Array
+    end: Array
+    duration: float
+    seeds: list[Array]
+
+    @staticmethod
+    def of(along: AlongNodes, given: Seeds, costates: Array | None = None) -> Backward:
+        """Of the running cost, what the seeds say, and the states after the intervals times costates (N, nx)."""
+        st, mesh = along.statement, along.mesh
+        n, m = mesh.intervals, mesh.substeps
+        reverse = derived(st, nominal_interval(st, 1, mesh.step), "reverse")
+        carried = np.zeros((st.nx, n)) if costates is None else costates.T
+        begin, end, duration, seeds = given.begin.copy(), given.end.copy(), 0.0, []
+        rest = [np.zeros(0)] * 3, [np.zeros((st.nx, n)), np.ones((1, n))]
+        for j in range(m - 1, -1, -1):
+            before, _, *columns = (values[:, j::m] for values in along.steps)
+            seeds.append(np.asfortranarray(given.after[:, j::m] + carried))
+            by = reverse.of_numbers([before, *columns, *rest[0], seeds[-1], *rest[1]], n)
+            carried = by[0] + given.before[:, j::m]
+            begin[:, j::m] += by[1]
+            end[:, j::m] += by[2]
+            duration += float(by[3 + DURATION].sum())
+        return Backward(x=carried.T, begin=begin, end=end, duration=duration, seeds=seeds[::-1])
+
+
+def by_controls(mesh: Mesh, begin: Array, end: Array) -> Array:
+    """Slopes by the control values, a row each, of those by the controls at both ends of each substep."""
+    n, m = mesh.intervals, mesh.substeps
+    first, last = begin.T, end.T
+    if m > 1:
+        one, other = first.reshape(n, m, -1), last.reshape(n, m, -1)
+        share = np.arange(m)[:, None] / m
+        first = ((1.0 - share) * one + (1.0 - share - 1.0 / m) * other).sum(axis=1)
+        last = (share * one + (share + 1.0 / m) * other).sum(axis=1)
+    result = np.zeros((mesh.control_nodes, begin.shape[0]))
+    result[:n] += first
+    result[int(mesh.control == "linear") :][:n] += last
+    return mesh.gathered(result)
+
+
+class Hessian:
+    """The Hessian of running cost, weighed half-vectors and continuity, by nodes and controls, times directions.
+
+    Where a matrix runs backward its half-vectors at the end move with x(T): that is not seen.
+    """
+
+    def __init__(self, along: AlongNodes, weights: Array, costates: Array) -> None:
+        """Prepare it.
+
+        Args:
+            along: whose steps they are; no matrix runs backward.
+            weights: of the half-vectors at the nodes, (N + 1, ne).
+            costates: of the states after the intervals, (N, nx).
+        """
+        st, mesh, self._mesh = along.statement, along.mesh, along.mesh
+        n, m = mesh.intervals, mesh.substeps
+        given = Seeds.of(along, weights)
+        seeds = Backward.of(along, given, costates).seeds
+        advance = nominal_interval(st, 1, mesh.step)
+        forward, back = derived(st, advance, "forward"), derived(st, advance, "reverse", "forward")
+        self._moved = [np.zeros_like(values, order="F") for values in along.steps[:4]]
+        self._nominal = []
+        still, unread = [None] * LATER, [None] * 3
+        cost = np.ones((1, n))
+        moved = np.zeros((st.nx, n), order="F")
+        for j in range(m):
+            before, _, *columns = (np.asfortranarray(values[:, j::m]) for values in along.steps)
+            controls = [np.zeros((st.nu, n), order="F") for _ in range(2)]
+            ahead = forward.prepared([before, *columns, *unread, moved, *controls, *still], n)
+            seed = np.zeros((st.nx, n), order="F")
+            adjoint = [before, *columns, *unread, seeds[j], None, cost, *([None] * (3 + LATER))]
+            behind = back.prepared([*adjoint, moved, *controls, *still, *unread, seed, None, None], n)
+            self._nominal.append((moved, controls, ahead, seed, behind))
+            moved = ahead.found[0]
+        self._ways = [
+            _Moved(along, way, self._moved, *own) for way, own in zip(along.ways, given.entries, strict=True)
+        ]
+
+    def __call__(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """The product with a direction of the states at the nodes (N + 1, nx) and of the control values, likewise."""
+        n, m = self._mesh.intervals, self._mesh.substeps
+        first, last = control_ends(self._mesh, u.T)
+        self._nominal[0][0][:] = x[:n].T
+        for j, (moved, (begin, end), ahead, _, _) in enumerate(self._nominal):
+            begin[:] = first + j / m * (last - first)
+            end[:] = first + (j + 1) / m * (last - first)
+            ahead.run()
+            for whole, part in zip(self._moved, (moved, ahead.found[0], begin, end), strict=True):
+                whole[:, j::m] = part
+        total = [np.zeros_like(values) for values in self._moved]
+        for way in self._ways:
+            way.add(total)
+        carried: Array | float = 0.0
+        for j in range(m - 1, -1, -1):
+            _, _, _, seed, behind = self._nominal[j]
+            seed[:] = total[1][:, j::m] + carried
+            behind.run()
+            carried = total[0][:, j::m]
+            if behind.found[0].size:
+                carried = carried + behind.found[0]
+            for whole, part in zip(total[2:], behind.found[1:3], strict=True):
+                if part.size:
+                    whole[:, j::m] += part
+        result = np.zeros_like(x)
+        result[:n] = np.asarray(carried).T
+        return result, by_controls(self._mesh, total[2], total[3])
+
+
+class _Moved:
+    """Tangents of the slopes of weighed half-vectors by the steps of one matrix."""
+
+    def __init__(
+        self, along: AlongNodes, way: Way, moved: Sequence[Array], seeds: Array, points: list[Array]
+    ) -> None:
+        """Prepare them for steps that move by what lies in `moved`: states and controls at both ends of each."""
+        st, count = along.statement, way.steps[0].shape[1]
+        still, unread = [None] * LATER, [None] * 2
+        self._course, self._seeds = way.course, seeds
+        self._ahead = derived(st, way.function, "forward").prepared([*way.steps, *unread, *moved, *still], count)
+        self._slopes = [np.zeros_like(values, order="F") for values in points]
+        adjoint = [*way.steps, *unread, *points, *([None] * (4 + LATER))]
+        self._back = derived(st, way.function, "reverse", "forward").prepared(
+            [*adjoint, *moved, *still, *unread, *self._slopes], count
+        )
+        self._entries = [np.zeros_like(values, order="F") for values in points]
+
+    def add(self, total: Sequence[Array]) -> None:
+        """Add those by the states and controls at both ends of each step."""
+        self._ahead.run()
+        for entries, found in zip(self._entries, self._ahead.found, strict=True):
+            if found.size:
+                entries[:] = found
+        self._course.tangents(self._seeds, self._entries, self._slopes)
+        self._back.run()
+        for result, found in zip(total, self._back.found, strict=False):
+            if found.size:
+                result += found
