@@ -8,6 +8,7 @@
 #include "thin.h"
 #include "kept.h"
 #include "along.h"
+#include "narrow.h"
 #include "transitions.h"
 #include "columns.h"
 
@@ -51,6 +52,11 @@ EXPORT int NAME(passage_tangent)(
     const Passage *p = &k->p;
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
     const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->ends, d = sizeof(double);
+    if (seed && !d_after && !d_by_kicks && is_narrow(k, kicks, seed, d_kicks, d_seed)) {
+        run(k, p->n, first, h1, h2, told, kicks);
+        const int done = narrow_second(k, p->n, seed, d_first, d_h1, d_h2, d_by_first, d_by_h1, d_by_h2);
+        if (done) return done < 0;
+    }
     if (!k->direction) {
         if (made(k, &k->direction, numbers(p))) return 1;
         memset(k->direction, 0, d * numbers(p)); /* compared before it is first written */

@@ -11,6 +11,9 @@ typedef struct {
     double *moved;  /* tangents of the stages and of X, of every step; NULL until they are asked for */
     double *turned; /* tangents of K, A, E+, of every reading, as `moved` */
     double *direction, *shifted; /* the last direction; the tangents of the half-vectors along it; as `moved` */
+    double *narrow; /* the last seed, and columns of all steps, see narrow.h; NULL until they are asked for */
+    size_t narrowed; /* their numbers */
+    int seeded;      /* steps of which the columns are known; 0: of none */
     size_t held; /* bytes of all of these */
 } Kept;
 
@@ -90,7 +93,7 @@ static int keep_stages(Kept *k) {
     } else
         whole = *p, whole.full = 1, stages(&whole, k->stages);
     *p = whole;
-    k->known = k->along = 0;
+    k->known = k->along = k->seeded = 0;
     return 0;
 }
 
@@ -101,7 +104,7 @@ static void run(
     const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * copied_entries(p);
     if (p->thin) p->h1 = h1, p->h2 = h2; /* they live as long as the call */
     if (here(k, first, h1, h2, told, kicks)) return;
-    k->known = k->along = 0;
+    k->known = k->along = k->seeded = 0;
     if (p->thin) digests_of(p, h1, h2, k->digests);
     memcpy(k->first, first, sizeof(double) * half);
     if (all) memcpy(k->h1, h1, all), memcpy(k->h2, h2, all);
