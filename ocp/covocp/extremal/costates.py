@@ -18,6 +18,7 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, read_only
 from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.along_nodes import along_nodes
+from covocp.extremal.costates_in_numbers import costates_in_numbers, has_forms
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, state_slope
@@ -401,6 +402,11 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
         return Costates(state=fine.state[::parts], matrices=fine.matrices[::parts])
     size = st.nx + st.ne
     values = fine_trajectory(extremal, 2 * pairs)
+    if has_forms(st):
+        given_last = np.concatenate(terminal_costates(extremal))
+        found = costates_in_numbers(extremal, pairs, values, given_last, impulses(extremal), _restarts(extremal))
+        if found is not None:
+            return Costates(state=found[:, : st.nx], matrices=found[:, st.nx :])
     interval = backward_interval(st, pairs)
     after, *rest = interval.mx_in()
     keep, known = ca.MX.sym("keep", size), ca.MX.sym("known", size)

@@ -1,0 +1,213 @@
+"""Costates integrated backward where the rates of all matrices have Riccati forms: by products of matrices of numbers.
+
+The same Runge-Kutta steps as those of the slopes of H, whose costates of a covariance E are those of n^2 entries: here
+P' = -(F - E W)' P - P (F - E W) is passed as a matrix, before the costates p' = -f_x' p - L_x - tr(P E')_x of the
+nominal, for which P is known at all stages of all steps.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array, pack_costate, unpack, unpack_costate
+from covocp.extremal.extremal import Extremal
+from covocp.passage.columns import derivative_in_columns, numbers_in_columns
+from covocp.statement.interval import Interval
+from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.numbers import columns_of_parts
+
+# Places of the stages of a step on the way back, among its start, middle and end; by how much each goes on from the
+# costate after the step along the slope of the stage before it, in steps, and its weight in the slope of the step.
+PLACES, SHARES, WEIGHTS = (2, 1, 1, 0), (0.0, 0.5, 0.5, 1.0), np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+
+# (x, u, t, T, parameters) of all steps at one place of them, a column for each.
+Point = list[Array]
+
+
+class _Form(NamedTuple):
+    """Entries of F, Q and W of a matrix that may be nonzero: function of the arguments of the model, rows, columns."""
+
+    function: ca.Function
+    patterns: tuple[tuple[Array, Array], ...]
+
+
+def has_forms(statement: Statement) -> bool:
+    """Whether all matrices run forward along the nominal by rates of Riccati form, and cost nothing on the way."""
+    st = statement
+    others = st.coupled or st.behind or st.summed or st.running_uses_matrices or st.samples is not None
+    return st.nominal is not None and not others and st.riccati_forms
+
+
+@lru_cache(maxsize=KEPT)
+def _form(statement: Statement, position: int) -> _Form | None:
+    """None where one of the three is zero by its form, and all else too."""
+    form = statement.riccati[position]
+    assert form is not None
+    symbols = [statement.symbolic.sym(form.name_in(i), form.size1_in(i)) for i in range(form.n_in())]
+    parts = form.call(symbols)
+    entries = [ca.sparsity_cast(part, ca.Sparsity.dense(part.nnz(), 1)) for part in parts]
+    patterns = tuple(tuple(np.array(v, dtype=np.intp) for v in part.sparsity().get_triplet()) for part in parts)
+    told = {"is_diff_in": [True] + [False] * (len(symbols) - 1)}
+    return _Form(ca.Function("form_entries", symbols, entries, told), patterns)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=KEPT)
+def _nominal_slopes(statement: Statement) -> ca.Function:
+    """(x, u, t, T, parameters) -> f_x column by column, L_x."""
+    nominal = statement.nominal
+    assert nominal is not None
+    symbols = [statement.symbolic.sym(nominal.name_in(i), nominal.size1_in(i)) for i in range(nominal.n_in())]
+    rate, cost = nominal.call(symbols)
+    slopes = [ca.vec(ca.densify(ca.jacobian(rate, symbols[0]))), ca.densify(ca.gradient(cost, symbols[0]))]
+    return ca.Function("nominal_slopes", symbols, slopes)
+
+
+def costates_in_numbers(
+    extremal: Extremal, pairs: int, values: Array, last: Array, jumps: Array, restarts: tuple[Array, Array]
+) -> Array | None:
+    """Costates at the nodes, (N + 1, nx + ne).
+
+    Args:
+        extremal: the trajectory; of a statement that `has_forms`.
+        pairs: Runge-Kutta steps an interval.
+        values: x and e at the starts, middles and ends of the steps, (N, 2 pairs + 1, nx + ne).
+        last: costates at the end, (nx + ne,).
+        jumps: what is added at the nodes, (N + 1, nx + ne).
+        restarts: which costates to keep at the ends of the intervals and what stands in place of the others, (nx + ne, N).
+
+    Returns:
+        None where the library cannot take the model.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    steps = Interval(*columns_of_parts(mesh, pairs, t.u.T, t.duration, extremal.parameters))
+    places = (slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))
+    z = [values[:, place].reshape(-1, values.shape[2]) for place in places]
+    points = [list(steps.at(j / 2, z[j][:, : st.nx].T)) for j in range(3)]
+    nominal = [numbers_in_columns(st, _nominal_slopes(st), point) for point in points]
+    if any(found is None for found in nominal):
+        return None
+    h = np.asarray(steps.h).ravel()
+    result, forcing = np.empty((mesh.intervals + 1, last.size)), []
+    result[-1] = last
+    for j in PLACES:
+        forcing.append(nominal[j][1].T)  # type: ignore[index]
+    for i, block in enumerate(st.matrices):
+        own = slice(st.nx + block.span.start, st.nx + block.span.stop)
+        halves = [part[:, own] for part in z]
+        among = jumps[:, own], (restarts[0][own].T, restarts[1][own].T)
+        found = _matrix(st, i, (points, halves, h), pairs, last[own], *among)
+        if found is None:
+            return None
+        result[:, own], by_x = found
+        forcing = [one + other for one, other in zip(forcing, by_x, strict=True)]
+    slopes = [found[0].T.reshape(-1, st.nx, st.nx) for found in nominal]  # type: ignore[index]
+    own = slice(0, st.nx)
+    among = jumps[:, own], (restarts[0][own].T, restarts[1][own].T)
+    result[:, own] = _nominal_costates(slopes, forcing, h, pairs, last[own], *among)
+    return result
+
+
+def _matrix(
+    statement: Statement,
+    position: int,
+    steps: tuple[list[Point], list[Array], Array],
+    pairs: int,
+    last: Array,
+    jumps: Array,
+    restarts: tuple[Array, Array],
+) -> tuple[Array, list[Array]] | None:
+    """Costates of one matrix at the nodes, and the slopes by x of tr(P E') at all stages; of the last costate."""
+    form, size, (points, halves, h) = _form(statement, position), statement.matrices[position].size, steps
+    if form is None:
+        return None
+    reverse = derivative_in_columns(statement, form.function, "reverse")
+    found = [numbers_in_columns(statement, form.function, point) for point in points]
+    if reverse is None or any(entries is None for entries in found):
+        return None
+    E = [unpack(half, size) for half in halves]
+    A = []  # F - E W
+    for values, entries in zip(E, found, strict=True):
+        drift, information = (_filled(size, form.patterns[k], entries[k]) for k in (0, 2))  # type: ignore[index]
+        A.append(drift - values @ information)
+    nodes, stages = _passed_back(A, h, pairs, unpack_costate(last, size), jumps, restarts)
+    by_x = []
+    for k, j in enumerate(PLACES):
+        P = stages[k]
+        loaded = P @ E[j]
+        weights = (2.0 * loaded, P, -E[j] @ loaded)  # of F, Q, W in tr(P (F E + E F' + Q - E W E))
+        seeds = [
+            np.asfortranarray(weight[:, rows, columns].T)
+            for weight, (rows, columns) in zip(weights, form.patterns, strict=True)
+        ]
+        slopes = reverse.of_numbers([*points[j], *[np.zeros(0)] * 3, *seeds], h.size)
+        by_x.append(slopes[0].T)
+    return nodes, by_x
+
+
+def _filled(size: int, pattern: tuple[Array, Array], entries: Array) -> Array:
+    """Matrices (K, size, size) of entries, a column for each matrix."""
+    result = np.zeros((entries.shape[1], size, size))
+    result[:, pattern[0], pattern[1]] = entries.T
+    return result
+
+
+def _passed_back(
+    A: list[Array], h: Array, pairs: int, P: Array, jumps: Array, restarts: tuple[Array, Array]
+) -> tuple[Array, list[Array]]:
+    """P' = -A' P - P A backward: half-vectors of costates at the nodes, and P at the four stages of all steps."""
+    size, (keep, known) = P.shape[0], restarts
+    stages = [np.empty((h.size, size, size)) for _ in PLACES]
+    nodes = np.empty((jumps.shape[0], jumps.shape[1]))
+    nodes[-1] = pack_costate(P)
+    turned = [np.ascontiguousarray(matrices.transpose(0, 2, 1)) for matrices in A]
+    all_kept = bool(keep.all())
+    for k in range(jumps.shape[0] - 2, -1, -1):
+        if not all_kept:
+            P = unpack_costate(keep[k] * pack_costate(P) + known[k], size)
+        for step in range((k + 1) * pairs - 1, k * pairs - 1, -1):
+            total, slope, length = np.zeros_like(P), P, h[step]
+            for stage, (j, share, weight) in enumerate(zip(PLACES, SHARES, WEIGHTS, strict=True)):
+                stages[stage][step] = P + share * length * slope if share else P
+                half = turned[j][step] @ stages[stage][step]
+                slope = half + half.T
+                total += weight * slope
+            P = P + length * total
+        if jumps[k].any():
+            P = P + unpack_costate(jumps[k], size)
+        nodes[k] = pack_costate(P)
+    return nodes, stages
+
+
+def _nominal_costates(
+    slopes: list[Array],
+    forcing: list[Array],
+    h: Array,
+    pairs: int,
+    last: Array,
+    jumps: Array,
+    restarts: tuple[Array, Array],
+) -> Array:
+    """p' = -f_x' p - g backward: each step is one matrix and what is added. f_x' (K, nx, nx) at the three places."""
+    size, (keep, known) = last.size, restarts
+    unit = np.concatenate([np.eye(size), np.zeros((size, 1))], axis=1)
+    value, slope, length = np.broadcast_to(unit, (h.size, size, size + 1)), 0.0, h[:, None, None]
+    total: Any = 0.0
+    for j, share, weight, g in zip(PLACES, SHARES, WEIGHTS, forcing, strict=True):
+        slope = slopes[j] @ (value + share * length * slope)
+        slope[:, :, -1] += g
+        total = total + weight * slope
+    through = value + length * total
+    nodes = np.empty((jumps.shape[0], size))
+    nodes[-1] = p = last
+    for k in range(jumps.shape[0] - 2, -1, -1):
+        p = keep[k] * p + known[k]
+        for step in range((k + 1) * pairs - 1, k * pairs - 1, -1):
+            p = through[step, :, :-1] @ p + through[step, :, -1]
+        p = p + jumps[k]
+        nodes[k] = p
+    return nodes
