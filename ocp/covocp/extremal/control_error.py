@@ -15,7 +15,7 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined, with_parts
-from covocp.extremal.hamiltonian import by_controls
+from covocp.extremal.hamiltonian import Costates, by_controls, terms_of
 from covocp.extremal.inside import controlled_nodes
 from covocp.statement.interval import repeated
 
@@ -108,7 +108,7 @@ def estimate_control_error(
     places = [along.at(j) for j in range(3)]
     convex = _convex(places, _magnitudes(extremal))
     if extremal.mesh.step == "rodas":
-        total = _by_middles(extremal, along, convex, kinds, places[1][2])
+        total = _by_middles(extremal, along, convex, kinds, places[1][1])
     else:
         total = _by_points(extremal, along, convex, kinds, places)
         left = (kinds[0] | kinds[1]) & ~convex
@@ -125,7 +125,7 @@ class _Along:
         fine: the extremal with these places as nodes.
         parts: of each interval.
         ends: controls at both ends of each interval (2, N, nu).
-        function: (x, u, e, t, T, p, costates) of all intervals -> H, H_u, H_uu, terms of H_u.
+        function: (x, u, e, t, T, p, costates) of all intervals -> H_u, H_uu, terms of H_u.
     """
 
     fine: Extremal
@@ -150,14 +150,23 @@ class _Along:
         """The control there, (N, nu)."""
         return self.ends[0] + j / self.parts * (self.ends[1] - self.ends[0])
 
-    def at(self, j: int, control: Array | None = None) -> list[Array]:
-        """H (N, 1, 1), H_u and its terms (N, nu, 1), H_uu (N, nu, nu) at place j, with another control where given."""
+    def at(self, j: int) -> list[Array]:
+        """H_u (N, nu, 1), H_uu (N, nu, nu) and terms of H_u at place j."""
+        columns, costates = self._points(j, self.control(j))
+        found = self.function.evaluated(*columns, costates.state.T, costates.matrices.T)
+        return [stacked(v, self.ends[0].shape[0]) for v in found]
+
+    def values(self, j: int, control: Array) -> Array:
+        """H there with another control, (N,)."""
+        return np.asarray(terms_of(self.fine.statement, *self._points(j, control)).sum(axis=1))
+
+    def _points(self, j: int, control: Array) -> tuple[list[Array], Costates]:
+        """Arguments of the model at place j of all intervals, a column each, and costates."""
         fine, n = self.fine, self.ends[0].shape[0]
         costates, t = discrete_costates(fine)[0], fine.trajectory
         at = slice(j, j + self.parts * (n - 1) + 1, self.parts)
-        known = (*repeated(t.duration, fine.parameters, n), costates.state[at].T, costates.matrices[at].T)
-        u = self.control(j) if control is None else control
-        return [stacked(v, n) for v in self.function.evaluated(t.x[at].T, u.T, t.e[at].T, fine.time[None, at], *known)]
+        columns = [t.x[at].T, control.T, t.e[at].T, fine.time[None, at], *repeated(t.duration, fine.parameters, n)]
+        return columns, Costates(state=costates.state[at], matrices=costates.matrices[at])
 
 
 def _convex(places: Sequence[Sequence[Array]], magnitudes: Array) -> Mask:
@@ -165,7 +174,7 @@ def _convex(places: Sequence[Sequence[Array]], magnitudes: Array) -> Mask:
 
     Beyond rounding: over the magnitude of a control its slope changes by more than a share of what this is a sum of.
     """
-    bends, terms = (np.array([place[k] for place in places]) for k in (2, 3))
+    bends, terms = (np.array([place[k] for place in places]) for k in (1, 2))
     beyond = np.diagonal(bends, axis1=2, axis2=3) * magnitudes > ROUNDING * terms[..., 0]
     found: Mask = np.all(beyond, axis=0)
     block = np.where(found[:, :, None] & found[:, None, :], bends, np.eye(bends.shape[-1]))
@@ -216,7 +225,7 @@ def _by_points(
 ) -> float:
     """By what is found at the ends and in the middles of the intervals, of the controls in which H is convex."""
     bounds, (free, bounded) = extremal.statement.control_bounds, kinds
-    places = [(along.control(j), slope, bend) for j, (_, slope, bend, _) in enumerate(found)]
+    places = [(along.control(j), slope, bend) for j, (slope, bend, _) in enumerate(found)]
     falls = [
         np.where(bounded & convex, _fall(u, slope[..., 0], bend, *bounds), 0.0).sum(axis=1) for u, slope, bend in places
     ]
@@ -242,11 +251,11 @@ def _above(extremal: Extremal, left: Mask, around: Array) -> float:
         differences = np.zeros((around.shape[0], PARTS + 1, left.shape[0]))
         for j in range(PARTS + 1):
             u = along.control(j)
-            value = along.at(j, u)[0]
+            value = along.values(j, u)
             for difference, other in zip(differences, around, strict=True):
                 moved = u.copy()
                 moved[:, i] = other[:, i]
-                difference[j] = (along.at(j, moved)[0] - value)[:, 0, 0]
+                difference[j] = along.values(j, moved) - value
         falls = np.maximum(-(SAMPLES @ differences).min(axis=0), 0.0).mean(axis=0)
         total += float(np.diff(extremal.time) @ np.where(left[:, i], falls, 0.0))
     return total

@@ -29,11 +29,30 @@ PLACES, SHARES, WEIGHTS = (2, 1, 1, 0), (0.0, 0.5, 0.5, 1.0), np.array([1.0, 2.0
 Point = list[Array]
 
 
+class _Pattern(NamedTuple):
+    """Rows and columns of the entries of a matrix that may be nonzero; the different ones among them."""
+
+    rows: list[int]
+    columns: list[int]
+    own_rows: list[int]
+    own_columns: list[int]
+
+    @property
+    def among_rows(self) -> list[int]:
+        """Positions of the rows among the different ones."""
+        return np.searchsorted(self.own_rows, self.rows).tolist()
+
+    @property
+    def among_columns(self) -> list[int]:
+        """The same of the columns."""
+        return np.searchsorted(self.own_columns, self.columns).tolist()
+
+
 class _Form(NamedTuple):
-    """Entries of F, Q and W of a matrix that may be nonzero: function of the arguments of the model, rows, columns."""
+    """Entries of F, Q and W of a matrix that may be nonzero, as a function of the arguments of the model."""
 
     function: ca.Function
-    patterns: tuple[tuple[Array, Array], ...]
+    patterns: tuple[_Pattern, ...]
 
 
 def has_forms(statement: Statement) -> bool:
@@ -44,16 +63,16 @@ def has_forms(statement: Statement) -> bool:
 
 
 @lru_cache(maxsize=KEPT)
-def _form(statement: Statement, position: int) -> _Form | None:
-    """None where one of the three is zero by its form, and all else too."""
+def _form(statement: Statement, position: int) -> _Form:
     form = statement.riccati[position]
     assert form is not None
     symbols = [statement.symbolic.sym(form.name_in(i), form.size1_in(i)) for i in range(form.n_in())]
     parts = form.call(symbols)
     entries = [ca.sparsity_cast(part, ca.Sparsity.dense(part.nnz(), 1)) for part in parts]
-    patterns = tuple(tuple(np.array(v, dtype=np.intp) for v in part.sparsity().get_triplet()) for part in parts)
+    places = [part.sparsity().get_triplet() for part in parts]
+    patterns = tuple(_Pattern(rows, columns, sorted(set(rows)), sorted(set(columns))) for rows, columns in places)
     told = {"is_diff_in": [True] + [False] * (len(symbols) - 1)}
-    return _Form(ca.Function("form_entries", symbols, entries, told), patterns)  # type: ignore[arg-type]
+    return _Form(ca.Function("form_entries", symbols, entries, told), patterns)
 
 
 @lru_cache(maxsize=KEPT)
@@ -123,8 +142,6 @@ def _matrix(
 ) -> tuple[Array, list[Array]] | None:
     """Costates of one matrix at the nodes, and the slopes by x of tr(P E') at all stages; of the last costate."""
     form, size, (points, halves, h) = _form(statement, position), statement.matrices[position].size, steps
-    if form is None:
-        return None
     reverse = derivative_in_columns(statement, form.function, "reverse")
     found = [numbers_in_columns(statement, form.function, point) for point in points]
     if reverse is None or any(entries is None for entries in found):
@@ -133,26 +150,27 @@ def _matrix(
     A = []  # F - E W
     for values, entries in zip(E, found, strict=True):
         drift, information = (_filled(size, form.patterns[k], entries[k]) for k in (0, 2))  # type: ignore[index]
-        A.append(drift - values @ information)
+        among, into = form.patterns[2].own_rows, form.patterns[2].own_columns  # where few entries are measured
+        drift[:, :, into] -= values[:, :, among] @ information[:, among][:, :, into]
+        A.append(drift)
     nodes, stages = _passed_back(A, h, pairs, unpack_costate(last, size), jumps, restarts)
     by_x = []
     for k, j in enumerate(PLACES):
-        P = stages[k]
-        loaded = P @ E[j]
-        weights = (2.0 * loaded, P, -E[j] @ loaded)  # of F, Q, W in tr(P (F E + E F' + Q - E W E))
-        seeds = [
-            np.asfortranarray(weight[:, rows, columns].T)
-            for weight, (rows, columns) in zip(weights, form.patterns, strict=True)
-        ]
+        P, (drift, noise, information) = stages[k], form.patterns
+        loaded = P @ E[j]  # 2 P E, P, - E P E are weights of F, Q, W in tr(P (F E + E F' + Q - E W E))
+        through = -E[j][:, information.own_rows] @ loaded[:, :, information.own_columns]
+        seeds = [2.0 * loaded[:, drift.rows, drift.columns], P[:, noise.rows, noise.columns]]
+        seeds.append(through[:, information.among_rows, information.among_columns])
+        seeds = [np.asfortranarray(seed.T) for seed in seeds]
         slopes = reverse.of_numbers([*points[j], *[np.zeros(0)] * 3, *seeds], h.size)
         by_x.append(slopes[0].T)
     return nodes, by_x
 
 
-def _filled(size: int, pattern: tuple[Array, Array], entries: Array) -> Array:
+def _filled(size: int, pattern: _Pattern, entries: Array) -> Array:
     """Matrices (K, size, size) of entries, a column for each matrix."""
     result = np.zeros((entries.shape[1], size, size))
-    result[:, pattern[0], pattern[1]] = entries.T
+    result[:, pattern.rows, pattern.columns] = entries.T
     return result
 
 

@@ -6,11 +6,12 @@ diagonal, 2 P_ij off it); `matrices.unpack_costate` gives P.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
 import casadi as ca
+import numpy as np
 
 from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
@@ -18,6 +19,7 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.nodes import mapped
 from covocp.extremal.slope_terms import absolute_terms
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
@@ -69,18 +71,18 @@ def _rates(statement: Statement) -> tuple[list[Expr], tuple[Expr, ...]]:
 
 @lru_cache(maxsize=KEPT)
 def by_controls(statement: Statement) -> ca.Function:
-    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu, absolute terms of H_u (`slope_terms`).
+    """(x, u, e, t, T, p, costate of x, costate of e) -> H_u, H_uu, absolute terms of H_u (`slope_terms`).
 
-    No function is made twice of one statement.
+    No function is made twice of one statement. H itself, of many more operations, is had from the rates (`terms_of`).
     """
     symbols, parts = _rates(statement)
     rates, weights, u = ca.vertcat(*parts), ca.vertcat(*symbols[6:], 1), symbols[1]
-    h = ca.dot(weights, rates)
     by_u = ca.jacobian(rates, u)  # of the few rates with a control in them: H itself goes through all
     # dense: a control may be in no rate, and CasADi takes no symmetric Jacobian of what has structural zeros
-    slope = ca.densify(by_u.T @ weights) if statement.symbolic is ca.SX else ca.gradient(h, u)
+    scalar = statement.symbolic is ca.SX
+    slope = ca.densify(by_u.T @ weights) if scalar else ca.gradient(ca.dot(weights, rates), u)
     bend = ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)
-    outputs = [h, slope, bend, absolute_terms(by_u, weights)]
+    outputs = [slope, bend, absolute_terms(by_u, weights)]
     return ca.Function("by_controls", symbols, [ca.densify(v) for v in outputs])
 
 
@@ -98,6 +100,19 @@ def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list
     values = Matrices(function.map(count)).evaluated(*extremal.columns(), costates.state.T, costates.matrices.T)
     result = [stacked(value, count) for value in values]
     return [numbers[:, :, 0] if numbers.shape[2] == 1 else numbers for numbers in result]
+
+
+def terms_of(statement: Statement, columns: Sequence[Any], costates: Costates) -> Array:
+    """Terms of H at some points: p_i f_i, the same of the half-vectors, L; (points, nx + ne + 1).
+
+    Args:
+        statement: the problem.
+        columns: (x, u, e, t, T, p) of the points, a column each.
+        costates: there.
+    """
+    rates = mapped(statement, "rates", costates.state.shape[0]).evaluated(*columns)
+    weighed = [costates.state * rates[0].T, costates.matrices * rates[1].T, rates[2].T]
+    return np.concatenate(weighed, axis=1)
 
 
 def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:

@@ -22,12 +22,11 @@ from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.finer_cost import change_on_finer_mesh
-from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope
+from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope, terms_of
 from covocp.extremal.inside import instant_control_slopes, instant_duration_slope
 from covocp.extremal.jumps import met_jumps
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
-from covocp.extremal.nodes import mapped
 from covocp.extremal.path_limits import acting
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes
@@ -301,13 +300,11 @@ class _AtNodes(NamedTuple):
 def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     """The Hamiltonian and its slopes at the nodes."""
     st = extremal.statement
-    h, slope, curvature, size = along(by_controls(st), extremal, costates)
+    slope, curvature, size = along(by_controls(st), extremal, costates)
     curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
-    rates, matrix_rates, running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())
-    terms = np.abs(costates.state * rates.T).sum(axis=1) + np.abs(costates.matrices * matrix_rates.T).sum(axis=1)
-    terms = terms + np.abs(running.ravel())
+    terms = terms_of(st, extremal.columns(), costates)
     sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
-    return _AtNodes(slope, curvature, np.column_stack([h[:, 0], terms]), sizes)
+    return _AtNodes(slope, curvature, np.column_stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)]), sizes)
 
 
 def _limit_slopes(extremal: Extremal) -> Array:
