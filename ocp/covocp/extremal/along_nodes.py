@@ -18,6 +18,7 @@ from covocp.base.dataclass import dataclass
 from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.base.threads import cached
 from covocp.passage.columns import FEWEST, OnColumns, derivative_in_columns, numbers_in_columns, numbers_in_turn
 from covocp.passage.library import functions
 from covocp.passage.sweep import Course
@@ -34,7 +35,7 @@ LATER, DURATION = 5, 2
 
 
 class Slopes(NamedTuple):
-    """Slopes by the states at the nodes (N + 1, nx), the control values, T; costates of the half-vectors (N + 1, ne)."""
+    """Costates at the nodes (N + 1, nx), slopes by the control values and by T, costates of the half-vectors (N + 1, ne)."""
 
     x: Array
     u: Array
@@ -75,22 +76,59 @@ class AlongNodes:
 
     __repr__ = short_repr
 
-    def slopes(self, weights: Array) -> Slopes:
-        """Slopes of the running cost and of weighed half-vectors.
+    @cached
+    def transitions(self) -> tuple[Array, Array, Array]:
+        """Slopes of the states after each interval by those before it and by the controls at its two ends.
+
+        Of constant controls the last two are shares of the same control. (N, nx, nx), (N, nx, nu), (N, nx, nu).
+        """
+        st, mesh = self.statement, self.mesh
+        n, m, nx, nu = mesh.intervals, mesh.substeps, st.nx, st.nu
+        size = nx + 2 * nu
+        forward = derived(st, nominal_interval(st, 1, mesh.step), "forward")
+        units = np.tile(np.eye(size), n)  # of each interval all directions, one after the other
+        moved, first, last = units[:nx], units[nx : nx + nu], units[nx + nu :]
+        for j in range(m):
+            before, _, *columns = (np.repeat(values[:, j::m], size, axis=1) for values in self.steps)
+            along = [(1.0 - c) * first + c * last for c in (j / m, (j + 1) / m)]
+            still = [np.zeros((shape.shape[0], n * size)) for shape in forward.inputs[-LATER:]]
+            moved = forward.of_numbers([before, *columns, *[np.zeros(0)] * 3, moved, *along, *still], n * size)[0]
+        whole = moved.reshape(nx, n, size).transpose(1, 0, 2)
+        return whole[:, :, :nx], whole[:, :, nx : nx + nu], whole[:, :, nx + nu :]
+
+    def slopes_by_end(self, weights: Array) -> tuple[Array, float]:
+        """Slopes by x(T) and T through what runs backward from there, of weights at the last node (ne,)."""
+        st = self.statement
+        if not st.behind:
+            return np.zeros(st.nx), 0.0
+        by_x, by_duration = _end_slopes(st)(*self.end, self.parameters, weights[st.entries(st.behind)])
+        return np.asarray(by_x.full()).ravel(), float(by_duration)
+
+    def slopes_at_end(self, weights: Array) -> Array:
+        """Slopes of weighed half-vectors by x(T)."""
+        return self.slopes_by_end(Seeds.of(self, weights).kicks[-1])[0]
+
+    def costates(self, weights: Array, last: Array, jumps: Array, restarts: tuple[Array, Array]) -> Slopes:
+        """Costates of the states at the nodes and of the half-vectors; slopes of the Lagrangian by controls and T.
 
         Args:
             weights: of the half-vectors at the nodes, (N + 1, ne).
+            last: costate at the end, (nx,), without what x(T) does through the matrices that start there.
+            jumps: what is added at the nodes, (N + 1, nx).
+            restarts: which costates to keep at the ends of the intervals (1 or 0) and what stands in place of the
+                others, (nx, N).
         """
-        seeds = Seeds.of(self, weights)
-        found = Backward.of(self, seeds)
-        x = np.vstack([found.x, np.zeros(self.statement.nx)])
-        duration = found.duration + seeds.duration
-        if self.statement.behind:
-            last = seeds.kicks[-1, self.statement.entries(self.statement.behind)]
-            by_x, by_duration = _end_slopes(self.statement)(*self.end, self.parameters, last)
-            x[-1] += np.asarray(by_x.full()).ravel()
-            duration += float(by_duration)
-        return Slopes(x, by_controls(self.mesh, found.begin, found.end), duration, seeds.kicks)
+        seeds, (keep, known) = Seeds.of(self, weights), restarts
+        own, (by_end, duration) = Backward.of(self, seeds).x, self.slopes_by_end(seeds.kicks[-1])
+        through, n = self.transitions[0].transpose(0, 2, 1), self.mesh.intervals
+        result, after = np.empty((n + 1, last.size)), np.empty((n, last.size))
+        result[n] = value = last + by_end
+        for k in range(n - 1, -1, -1):
+            after[k] = keep[:, k] * value + known[:, k]
+            result[k] = value = through[k] @ after[k] + own[k] + jumps[k]
+        found = Backward.of(self, seeds, after)
+        by_u = by_controls(self.mesh, found.begin, found.end)
+        return Slopes(result, by_u, found.duration + seeds.duration + duration, seeds.kicks)
 
 
 def along_nodes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array) -> AlongNodes | None:

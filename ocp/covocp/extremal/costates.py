@@ -116,8 +116,9 @@ def _discrete(extremal: Extremal) -> tuple[Costates, Array, float]:
         at_nodes = Costates(state=fine.state[::points], matrices=fine.matrices[::points])
         return at_nodes, prolongation(extremal.mesh).T @ slopes, by_duration
     mesh = extremal.mesh
-    along = bool(st.matrices) and mesh.eliminated and not st.coupled and mesh.step != "rk4"
-    if st.behind or along:
+    apart = bool(st.matrices) and mesh.eliminated and not st.coupled and mesh.step != "rk4"
+    alone = not st.matrices and along_nodes(st, mesh, extremal.trajectory, extremal.parameters) is not None
+    if st.behind or apart or alone:
         return _costates_of_passages(extremal)
     last = np.concatenate(terminal_costates(extremal))
     z = np.hstack([extremal.trajectory.x, extremal.trajectory.e])
@@ -163,12 +164,18 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     weights = jumps[:, nx:].copy()
     weights[-1] = last_e
     weights[-1, behind] = direct
-    by_x, by_u, by_duration, kicks = _through_passages(extremal, weights)
+    along = along_nodes(st, extremal.mesh, t, extremal.parameters)
+    if along is not None:
+        keep, known = (values[:nx] for values in _restarts(extremal))
+        costates, slopes, total, kicks = along.costates(weights, last_x, jumps[:, :nx], (keep, known))
+    else:
+        by_x, by_u, by_duration, kicks = _through_passages(extremal, weights)
+        last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
+        costates, slopes, total = _swept(extremal, last_x, jumps[:, :nx] + by_x, t.x, nominal=True)
+        slopes, total = slopes + by_u, total + float(by_duration.item())
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
-    last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
-    costates, slopes, total = _swept(extremal, last_x, jumps[:, :nx] + by_x, t.x, nominal=True)
-    return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
+    return Costates(state=costates, matrices=kicks), slopes, total
 
 
 def without_passage(extremal: Extremal) -> Extremal:
@@ -184,17 +191,14 @@ def without_passage(extremal: Extremal) -> Extremal:
     weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)
     weights[-1, behind] -= m.final_matrices[behind]
-    through = _through_passages(fine, weights)[0][-1]
+    along = along_nodes(st, fine.mesh, fine.trajectory, fine.parameters)
+    through = _through_passages(fine, weights)[0][-1] if along is None else along.slopes_at_end(weights)
     return replace(extremal, multipliers=replace(m, final=m.final - through))
 
 
 def _through_passages(extremal: Extremal, weights: Array) -> tuple[Array, ...]:
     """What `passage_slopes` gives along an extremal for weights of the half-vectors (N + 1, ne), the node first."""
     t = extremal.trajectory
-    along = along_nodes(extremal.statement, extremal.mesh, t, extremal.parameters)
-    if along is not None:
-        found = along.slopes(weights)
-        return found.x, found.u, np.array(found.duration), found.kicks
     given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T, np.zeros_like(weights.T))
     return tuple(v.T for v in passage_slopes(extremal.statement, extremal.mesh).evaluated(*given))
 

@@ -279,6 +279,9 @@ def slopes_of_intervals(extremal: Extremal) -> tuple[Array, Array, Array]:
         (N, n, n), (N, n, nu), (N, n, nu); of constant controls the last two are shares of the same control.
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    along = along_nodes(st, mesh, t, extremal.parameters)
+    if along is not None:
+        return along.transitions
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
     common = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
     if is_staged(st, mesh):
