@@ -1,8 +1,7 @@
 """Costates integrated backward where the rates of all matrices have Riccati forms: by products of matrices of numbers.
 
-The same Runge-Kutta steps as those of the slopes of H, whose costates of a covariance E are those of n^2 entries: here
-P' = -(F - E W)' P - P (F - E W) is passed as a matrix, before the costates p' = -f_x' p - L_x - tr(P E')_x of the
-nominal, for which P is known at all stages of all steps.
+Slopes of H by all entries of a covariance E are long expressions: here P' = -(F - E W)' P - P (F - E W) is passed as a
+matrix, by Runge-Kutta steps of its transitions, before the costates p' = -f_x' p - L_x - tr(P E')_x of the nominal.
 """
 
 from __future__ import annotations
@@ -111,10 +110,7 @@ def costates_in_numbers(
     if any(found is None for found in nominal):
         return None
     h = np.asarray(steps.h).ravel()
-    result, forcing = np.empty((mesh.intervals + 1, last.size)), []
-    result[-1] = last
-    for j in PLACES:
-        forcing.append(nominal[j][1].T)  # type: ignore[index]
+    result, forcing = np.empty((mesh.intervals + 1, last.size)), [found[1].T for found in nominal]  # type: ignore[index]
     for i, block in enumerate(st.matrices):
         own = slice(st.nx + block.span.start, st.nx + block.span.stop)
         halves = [part[:, own] for part in z]
@@ -140,7 +136,7 @@ def _matrix(
     jumps: Array,
     restarts: tuple[Array, Array],
 ) -> tuple[Array, list[Array]] | None:
-    """Costates of one matrix at the nodes, and the slopes by x of tr(P E') at all stages; of the last costate."""
+    """Costates of one matrix at the nodes, and the slopes by x of tr(P E') at the three places of all steps."""
     form, size, (points, halves, h) = _form(statement, position), statement.matrices[position].size, steps
     reverse = derivative_in_columns(statement, form.function, "reverse")
     found = [numbers_in_columns(statement, form.function, point) for point in points]
@@ -153,10 +149,10 @@ def _matrix(
         among, into = form.patterns[2].own_rows, form.patterns[2].own_columns  # where few entries are measured
         drift[:, :, into] -= values[:, :, among] @ information[:, among][:, :, into]
         A.append(drift)
-    nodes, stages = _passed_back(A, h, pairs, unpack_costate(last, size), jumps, restarts)
+    nodes, ends = _passed_back(A, h, pairs, unpack_costate(last, size), jumps, restarts)
     by_x = []
-    for k, j in enumerate(PLACES):
-        P, (drift, noise, information) = stages[k], form.patterns
+    for j, P in enumerate(_three_places(A, h, ends)):
+        drift, noise, information = form.patterns
         loaded = P @ E[j]  # 2 P E, P, - E P E are weights of F, Q, W in tr(P (F E + E F' + Q - E W E))
         through = -E[j][:, information.own_rows] @ loaded[:, :, information.own_columns]
         seeds = [2.0 * loaded[:, drift.rows, drift.columns], P[:, noise.rows, noise.columns]]
@@ -176,29 +172,56 @@ def _filled(size: int, pattern: _Pattern, entries: Array) -> Array:
 
 def _passed_back(
     A: list[Array], h: Array, pairs: int, P: Array, jumps: Array, restarts: tuple[Array, Array]
-) -> tuple[Array, list[Array]]:
-    """P' = -A' P - P A backward: half-vectors of costates at the nodes, and P at the four stages of all steps."""
+) -> tuple[Array, tuple[Array, Array]]:
+    """P' = -A' P - P A backward: half-vectors of costates at the nodes; P at the start and at the end of each step.
+
+    P = M M' for M' = -A' M where it has a root: each step is a congruence, by the Runge-Kutta step of M.
+    """
     size, (keep, known) = P.shape[0], restarts
-    stages = [np.empty((h.size, size, size)) for _ in PLACES]
+    starts, ends = np.empty((2, h.size, size, size))
     nodes = np.empty((jumps.shape[0], jumps.shape[1]))
     nodes[-1] = pack_costate(P)
-    turned = [np.ascontiguousarray(matrices.transpose(0, 2, 1)) for matrices in A]
-    all_kept = bool(keep.all())
+    through = _steps([matrices.transpose(0, 2, 1) for matrices in A], h, np.eye(size))
+    turned = np.ascontiguousarray(through.transpose(0, 2, 1))
+    all_kept, still = bool(keep.all()), not jumps.any()
     for k in range(jumps.shape[0] - 2, -1, -1):
         if not all_kept:
             P = unpack_costate(keep[k] * pack_costate(P) + known[k], size)
         for step in range((k + 1) * pairs - 1, k * pairs - 1, -1):
-            total, slope, length = np.zeros_like(P), P, h[step]
-            for stage, (j, share, weight) in enumerate(zip(PLACES, SHARES, WEIGHTS, strict=True)):
-                stages[stage][step] = P + share * length * slope if share else P
-                half = turned[j][step] @ stages[stage][step]
-                slope = half + half.T
-                total += weight * slope
-            P = P + length * total
-        if jumps[k].any():
+            ends[step] = P
+            P = through[step] @ P @ turned[step]
+            starts[step] = P
+        if not still:
             P = P + unpack_costate(jumps[k], size)
         nodes[k] = pack_costate(P)
-    return nodes, stages
+    return nodes, (starts, ends)
+
+
+def _three_places(A: list[Array], h: Array, ends: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+    """P at the starts, middles and ends of all steps: a cubic polynomial by its slopes."""
+    slopes = [half + half.transpose(0, 2, 1) for half in (P @ A[j] for P, j in zip(ends, (0, 2), strict=True))]
+    start, end = ends
+    return start, 0.5 * (start + end) + h[:, None, None] / 8.0 * (slopes[1] - slopes[0]), end
+
+
+def _steps(slopes: list[Array], h: Array, unit: Array, forcing: list[Array] | None = None) -> Array:
+    """Runge-Kutta steps backward of value' = -slope value - forcing from a unit, (K, n, columns).
+
+    Args:
+        slopes: at the start, the middle and the end of each step, (K, n, n).
+        h: lengths of the steps.
+        unit: (n, columns).
+        forcing: added to the slope of the last column at these places, (K, n).
+    """
+    value: Any = np.broadcast_to(unit, (h.size, *unit.shape))
+    total: Any = 0.0
+    slope, length = value, h[:, None, None]
+    for j, share, weight in zip(PLACES, SHARES, WEIGHTS, strict=True):
+        slope = slopes[j] @ (value + share * length * slope if share else value)
+        if forcing is not None:
+            slope[:, :, -1] += forcing[j]
+        total = total + weight * slope
+    return np.asarray(value + length * total)
 
 
 def _nominal_costates(
@@ -210,16 +233,9 @@ def _nominal_costates(
     jumps: Array,
     restarts: tuple[Array, Array],
 ) -> Array:
-    """p' = -f_x' p - g backward: each step is one matrix and what is added. f_x' (K, nx, nx) at the three places."""
+    """p' = -f_x' p - g backward: each step is one matrix and what is added. f_x' (K, nx, nx), g at the three places."""
     size, (keep, known) = last.size, restarts
-    unit = np.concatenate([np.eye(size), np.zeros((size, 1))], axis=1)
-    value, slope, length = np.broadcast_to(unit, (h.size, size, size + 1)), 0.0, h[:, None, None]
-    total: Any = 0.0
-    for j, share, weight, g in zip(PLACES, SHARES, WEIGHTS, forcing, strict=True):
-        slope = slopes[j] @ (value + share * length * slope)
-        slope[:, :, -1] += g
-        total = total + weight * slope
-    through = value + length * total
+    through = _steps(slopes, h, np.concatenate([np.eye(size), np.zeros((size, 1))], axis=1), forcing)
     nodes = np.empty((jumps.shape[0], size))
     nodes[-1] = p = last
     for k in range(jumps.shape[0] - 2, -1, -1):
