@@ -6,6 +6,7 @@ import numpy as np
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked, unpack
+from covocp.extremal.costates_in_numbers import drift_matrices
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.stiffness import state_jacobian
@@ -54,10 +55,13 @@ def _linear(extremal: Extremal) -> list[tuple[Array, float]]:
     for i, (block, form) in enumerate(zip(st.matrices, st.riccati, strict=True)):
         if form is None:
             continue
-        parts = Matrices(form.map(count)).evaluated(x, u, *others)
-        drift, _, information = (stacked(part, count) for part in parts)
         values = unpack(extremal.trajectory.e[:, list(st.entries((i,)))], block.size)
-        result.append((drift - values @ information, 2.0))
+        matrices = drift_matrices(st, i, [np.asarray(column) for column in (x, u, *others)], values)
+        if matrices is None:
+            parts = Matrices(form.map(count)).evaluated(x, u, *others)
+            drift, _, information = (stacked(part, count) for part in parts)
+            matrices = drift - values @ information
+        result.append((matrices, 2.0))
     return result
 
 

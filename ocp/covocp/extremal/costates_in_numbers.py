@@ -139,16 +139,11 @@ def _matrix(
     """Costates of one matrix at the nodes, and the slopes by x of tr(P E') at the three places of all steps."""
     form, size, (points, halves, h) = _form(statement, position), statement.matrices[position].size, steps
     reverse = derivative_in_columns(statement, form.function, "reverse")
-    found = [numbers_in_columns(statement, form.function, point) for point in points]
-    if reverse is None or any(entries is None for entries in found):
-        return None
     E = [unpack(half, size) for half in halves]
-    A = []  # F - E W
-    for values, entries in zip(E, found, strict=True):
-        drift, information = (_filled(size, form.patterns[k], entries[k]) for k in (0, 2))  # type: ignore[index]
-        among, into = form.patterns[2].own_rows, form.patterns[2].own_columns  # where few entries are measured
-        drift[:, :, into] -= values[:, :, among] @ information[:, among][:, :, into]
-        A.append(drift)
+    found = [drift_matrices(statement, position, *place) for place in zip(points, E, strict=True)]
+    A = [matrices for matrices in found if matrices is not None]
+    if reverse is None or len(A) < len(found):
+        return None
     nodes, ends = _passed_back(A, h, pairs, unpack_costate(last, size), jumps, restarts)
     by_x = []
     for j, P in enumerate(_three_places(A, h, ends)):
@@ -161,6 +156,28 @@ def _matrix(
         slopes = reverse.of_numbers([*points[j], *[np.zeros(0)] * 3, *seeds], h.size)
         by_x.append(slopes[0].T)
     return nodes, by_x
+
+
+def drift_matrices(statement: Statement, position: int, point: Point, values: Array) -> Array | None:
+    """F - E W of a matrix whose rate has Riccati form, (K, n, n).
+
+    Args:
+        statement: the problem.
+        position: of the matrix.
+        point: (x, u, t, T, parameters), a column for each.
+        values: E there, (K, n, n).
+
+    Returns:
+        None where the library cannot take the model.
+    """
+    form = _form(statement, position)
+    entries = numbers_in_columns(statement, form.function, point)
+    if entries is None:
+        return None
+    drift, information = (_filled(values.shape[1], form.patterns[k], entries[k]) for k in (0, 2))
+    among, into = form.patterns[2].own_rows, form.patterns[2].own_columns  # where few entries are measured
+    drift[:, :, into] -= values[:, :, among] @ information[:, among][:, :, into]
+    return drift
 
 
 def _filled(size: int, pattern: _Pattern, entries: Array) -> Array:

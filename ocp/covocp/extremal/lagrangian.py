@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered
+from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.along_nodes import Hessian, along_nodes
+from covocp.extremal.costates import terminal_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.passage.columns import in_columns
@@ -84,6 +86,9 @@ def second_order(
         nodes one after the other, then the controls.
     """
     st, n = statement, mesh.intervals
+    curved = bool(st.path.size or st.start.size or st.end.size or st.inside.size) or _terminal(st).curved
+    if alone and not curved:  # nor is any row held but states
+        return None, None
     size = node_size(st)
     split = size * (n + 1)
     w = ca.MX.sym("w", split + st.nu * mesh.control_nodes)
@@ -129,7 +134,7 @@ def second_order(
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions and kind not in OF_STATES]
     inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices, none]
     function = None
-    if not alone or _curved(st):
+    if not alone or curved:
         direction = ca.MX.sym("direction", w.shape[0])
         gradient = ca.gradient((1 + none[0]) * value, w)
         product = ca.densify(ca.forward([gradient], [w, none], [[direction, ca.repmat(none[1], 2, 1)]])[0][0])
@@ -159,24 +164,19 @@ def _passed(
     return e, seen, cost, ends
 
 
-def _curved(statement: Statement) -> bool:
-    """Whether anything that stands at the nodes may have second derivatives by states and controls."""
-    st = statement
-    if st.path.size or st.start.size or st.end.size or st.inside.size:
-        return True
-    symbols = [st.symbolic.sym(name, st.terminal.size1_in(i)) for i, name in enumerate("xeTp")]
-    return bool(ca.depends_on(ca.gradient(st.terminal(*symbols), symbols[0]), symbols[0]))
+class _Terminal(NamedTuple):
+    """What the form of the terminal cost tells: whether its slope by x(T) moves with it, that by half-vectors with any."""
+
+    curved: bool
+    bent: bool
 
 
 @lru_cache(maxsize=4)
-def terminal_weights(statement: Statement) -> ca.Function | None:
-    """(T, parameters) -> slopes of the terminal cost by the half-vectors; None where they depend on anything else."""
-    st = statement
-    symbols = [st.symbolic.sym(name, st.terminal.size1_in(i)) for i, name in enumerate("xeTp")]
-    slope = ca.gradient(st.terminal(*symbols), symbols[1])
-    if ca.depends_on(slope, ca.vertcat(*symbols[:2])):
-        return None
-    return ca.Function("terminal_weights", symbols[2:], [ca.densify(slope)])
+def _terminal(statement: Statement) -> _Terminal:
+    end, symbolic = statement.terminal, statement.symbolic
+    x, e, *others = (symbolic.sym(end.name_in(i), end.size1_in(i)) for i in range(end.n_in()))
+    by_x, by_e = slopes_by(end(x, e, *others), (x, e))
+    return _Terminal(bool(ca.depends_on(by_x, x)), bool(ca.depends_on(by_e, ca.vertcat(x, e))))
 
 
 def product_along(
@@ -239,11 +239,9 @@ def _hessian(extremal: Extremal, costates: Costates, held: Entries) -> Hessian |
     if along is None:
         return None
     if st.ne:
-        slopes = terminal_weights(st)
-        if slopes is None:
+        if _terminal(st).bent:
             return None
-        by_terminal = slopes(extremal.trajectory.duration, extremal.parameters)
-        weights[-1] += m.final_matrices + np.asarray(by_terminal.full()).ravel()
+        weights[-1] += terminal_costates(extremal)[1]
     return Hessian(along, weights, costates.state[1:])
 
 
