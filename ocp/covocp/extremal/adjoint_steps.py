@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.base.buffered import Matrices
-from covocp.base.matrices import Array, stacked, unpack
+from covocp.base.matrices import Array, own_units, stacked, unpack
 from covocp.extremal.costates_in_numbers import drift_matrices
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.stiffness import state_jacobian
 
-# How often a matrix is squared to bound its spectral radius.
-SQUARED = 3
+# How often a matrix is squared to bound its spectral radius; by how many steps an interval the bound may be above it.
+SQUARED, ABOVE = 4, 0.1
 
 
 def explicit_pairs(extremal: Extremal) -> tuple[int, int]:
@@ -31,7 +31,7 @@ def explicit_pairs(extremal: Extremal) -> tuple[int, int]:
     for matrices, times in _linear(extremal):
         unknown, rates = not np.isfinite(matrices).all(), np.zeros(mesh.intervals + 1)
         asked = np.ones(mesh.intervals + 1, dtype=bool)
-        for largest in (_norms, _norms_of_powers, _radii):  # what bounds the rates is had sooner than they are
+        for largest in (_norms, _norms_of_powers):  # the first bound of the rates is had sooner than the closer one
             with np.errstate(over="ignore", invalid="ignore"):
                 rates[asked] = times * largest(matrices[asked])
                 steps = np.maximum(rates[1:], rates[:-1]) * lengths / STIFFNESS_PER_STEP
@@ -42,7 +42,7 @@ def explicit_pairs(extremal: Extremal) -> tuple[int, int]:
         needed = np.maximum(needed, np.where(np.isfinite(steps), steps, np.inf))
     many = np.flatnonzero(needed > max(LARGEST_SUBSTEPS, own))
     first = 0 if not many.size else int(many[-1]) + 1
-    return int(np.ceil(needed[first:].max(initial=float(own)))), first
+    return int(np.ceil((needed[first:] - ABOVE).max(initial=float(own)))), first
 
 
 def _linear(extremal: Extremal) -> list[tuple[Array, float]]:
@@ -61,7 +61,8 @@ def _linear(extremal: Extremal) -> list[tuple[Array, float]]:
             parts = Matrices(form.map(count)).evaluated(x, u, *others)
             drift, _, information = (stacked(part, count) for part in parts)
             matrices = drift - values @ information
-        result.append((matrices, 2.0))
+        units = own_units(values)  # in these the bounds are near the radii, whatever units the model has
+        result.append((matrices * units[:, None, :] / units[:, :, None], 2.0))
     return result
 
 
@@ -72,16 +73,9 @@ def _norms(matrices: Array) -> Array:
 
 
 def _norms_of_powers(matrices: Array) -> Array:
-    """Closer bounds: roots of the same of a power of the matrices."""
+    """Closer bounds: roots of the same of a power of the matrices, a few hundredths above where n^(1/16) is little."""
     scale = np.maximum(np.abs(matrices).max(axis=(1, 2), initial=0.0), np.finfo(float).tiny)
     powers = matrices / scale[:, None, None]
     for _ in range(SQUARED):
         powers = powers @ powers
     return np.asarray(scale * _norms(powers) ** (0.5**SQUARED))
-
-
-def _radii(matrices: Array) -> Array:
-    """Spectral radii."""
-    if not np.isfinite(matrices).all():
-        return np.full(matrices.shape[0], np.nan)
-    return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=1, initial=0.0))

@@ -76,25 +76,24 @@ class AlongNodes:
 
     __repr__ = short_repr
 
+    def at(self, j: int) -> list[Array]:
+        """States before substep j of all intervals, and what `Interval` has of it."""
+        before, _, *columns = (np.asfortranarray(values[:, j :: self.mesh.substeps]) for values in self.steps)
+        return [before, *columns]
+
     @cached
     def transitions(self) -> tuple[Array, Array, Array]:
         """Slopes of the states after each interval by those before it and by the controls at its two ends.
 
         Of constant controls the last two are shares of the same control. (N, nx, nx), (N, nx, nu), (N, nx, nu).
         """
-        st, mesh = self.statement, self.mesh
-        n, m, nx, nu = mesh.intervals, mesh.substeps, st.nx, st.nu
-        size = nx + 2 * nu
-        forward = derived(st, nominal_interval(st, 1, mesh.step), "forward")
-        units = np.tile(np.eye(size), n)  # of each interval all directions, one after the other
-        moved, first, last = units[:nx], units[nx : nx + nu], units[nx + nu :]
-        for j in range(m):
-            before, _, *columns = (np.repeat(values[:, j::m], size, axis=1) for values in self.steps)
-            along = [(1.0 - c) * first + c * last for c in (j / m, (j + 1) / m)]
-            still = [np.zeros((shape.shape[0], n * size)) for shape in forward.inputs[-LATER:]]
-            moved = forward.of_numbers([before, *columns, *[np.zeros(0)] * 3, moved, *along, *still], n * size)[0]
-        whole = moved.reshape(nx, n, size).transpose(1, 0, 2)
-        return whole[:, :, :nx], whole[:, :, nx : nx + nu], whole[:, :, nx + nu :]
+        st, n, ahead = self.statement, self.mesh.intervals, Ahead(self)
+        nx, nu = st.nx, st.nu
+        units = np.eye(nx + 2 * nu)
+        moved = np.empty((n, nx, units.shape[0]))
+        for k, unit in enumerate(units):
+            moved[:, :, k] = ahead(*(unit[part, None] for part in np.split(np.arange(unit.size), (nx, nx + nu)))).T
+        return moved[:, :, :nx], moved[:, :, nx : nx + nu], moved[:, :, nx + nu :]
 
     def slopes_by_end(self, weights: Array) -> tuple[Array, float]:
         """Slopes by x(T) and T through what runs backward from there, of weights at the last node (ne,)."""
@@ -272,9 +271,8 @@ class Backward:
         begin, end, duration, seeds = given.begin.copy(), given.end.copy(), 0.0, []
         rest = [np.zeros(0)] * 3, [np.zeros((st.nx, n)), np.ones((1, n))]
         for j in range(m - 1, -1, -1):
-            before, _, *columns = (values[:, j::m] for values in along.steps)
             seeds.append(np.asfortranarray(given.after[:, j::m] + carried))
-            by = reverse.of_numbers([before, *columns, *rest[0], seeds[-1], *rest[1]], n)
+            by = reverse.of_numbers([*along.at(j), *rest[0], seeds[-1], *rest[1]], n)
             carried = by[0] + given.before[:, j::m]
             begin[:, j::m] += by[1]
             end[:, j::m] += by[2]
@@ -297,6 +295,39 @@ def by_controls(mesh: Mesh, begin: Array, end: Array) -> Array:
     return mesh.gathered(result)
 
 
+class Ahead:
+    """Tangents of the states after all intervals, each from its own node.
+
+    Attributes:
+        steps: tangents before the first, second, ... substep of all intervals, of the controls at both ends of it, and
+            after it, a column for each interval.
+    """
+
+    def __init__(self, along: AlongNodes) -> None:
+        """Prepare them."""
+        st, mesh = along.statement, along.mesh
+        self._count, n = mesh.substeps, mesh.intervals
+        forward = derived(st, nominal_interval(st, 1, mesh.step), "forward")
+        self.steps: list[tuple[Array, Array, Array, Array]] = []
+        self._runs = []
+        moved = np.zeros((st.nx, n), order="F")
+        for j in range(mesh.substeps):
+            controls = [np.zeros((st.nu, n), order="F") for _ in range(2)]
+            given = [*along.at(j), *([None] * 3), moved, *controls, *([None] * LATER)]
+            self._runs.append(forward.prepared(given, n))
+            self.steps.append((moved, controls[0], controls[1], self._runs[-1].found[0]))
+            moved = self._runs[-1].found[0]
+
+    def __call__(self, x: Array, first: Array, last: Array) -> Array:
+        """Along tangents of the states before the intervals (nx, N) and of the controls at both ends; (nx, N)."""
+        self.steps[0][0][:] = x
+        for j, (_, begin, end, _) in enumerate(self.steps):
+            begin[:] = first + j / self._count * (last - first)
+            end[:] = first + (j + 1) / self._count * (last - first)
+            self._runs[j].run()
+        return self.steps[-1][3]
+
+
 class Hessian:
     """The Hessian of running cost, weighed half-vectors and continuity, by nodes and controls, times directions.
 
@@ -312,25 +343,19 @@ class Hessian:
             costates: of the states after the intervals, (N, nx).
         """
         st, mesh, self._mesh = along.statement, along.mesh, along.mesh
-        n, m = mesh.intervals, mesh.substeps
+        n = mesh.intervals
         given = Seeds.of(along, weights)
         seeds = Backward.of(along, given, costates).seeds
-        advance = nominal_interval(st, 1, mesh.step)
-        forward, back = derived(st, advance, "forward"), derived(st, advance, "reverse", "forward")
+        back = derived(st, nominal_interval(st, 1, mesh.step), "reverse", "forward")
         self._moved = [np.zeros_like(values, order="F") for values in along.steps[:4]]
-        self._nominal = []
+        self._ahead, self._nominal = Ahead(along), []
         still, unread = [None] * LATER, [None] * 3
         cost = np.ones((1, n))
-        moved = np.zeros((st.nx, n), order="F")
-        for j in range(m):
-            before, _, *columns = (np.asfortranarray(values[:, j::m]) for values in along.steps)
-            controls = [np.zeros((st.nu, n), order="F") for _ in range(2)]
-            ahead = forward.prepared([before, *columns, *unread, moved, *controls, *still], n)
+        for j, (moved, begin, end, _) in enumerate(self._ahead.steps):
             seed = np.zeros((st.nx, n), order="F")
-            adjoint = [before, *columns, *unread, seeds[j], None, cost, *([None] * (3 + LATER))]
-            behind = back.prepared([*adjoint, moved, *controls, *still, *unread, seed, None, None], n)
-            self._nominal.append((moved, controls, ahead, seed, behind))
-            moved = ahead.found[0]
+            adjoint = [*along.at(j), *unread, seeds[j], None, cost, *([None] * (3 + LATER))]
+            behind = back.prepared([*adjoint, moved, begin, end, *still, *unread, seed, None, None], n)
+            self._nominal.append((seed, behind))
         self._ways = [
             _Moved(along, way, self._moved, *own) for way, own in zip(along.ways, given.entries, strict=True)
         ]
@@ -338,20 +363,16 @@ class Hessian:
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array]:
         """The product with a direction of the states at the nodes (N + 1, nx) and of the control values, likewise."""
         n, m = self._mesh.intervals, self._mesh.substeps
-        first, last = control_ends(self._mesh, u.T)
-        self._nominal[0][0][:] = x[:n].T
-        for j, (moved, (begin, end), ahead, _, _) in enumerate(self._nominal):
-            begin[:] = first + j / m * (last - first)
-            end[:] = first + (j + 1) / m * (last - first)
-            ahead.run()
-            for whole, part in zip(self._moved, (moved, ahead.found[0], begin, end), strict=True):
+        self._ahead(x[:n].T, *control_ends(self._mesh, u.T))
+        for j, (moved, begin, end, after) in enumerate(self._ahead.steps):
+            for whole, part in zip(self._moved, (moved, after, begin, end), strict=True):
                 whole[:, j::m] = part
         total = [np.zeros_like(values) for values in self._moved]
         for way in self._ways:
             way.add(total)
         carried: Array | float = 0.0
         for j in range(m - 1, -1, -1):
-            _, _, _, seed, behind = self._nominal[j]
+            seed, behind = self._nominal[j]
             seed[:] = total[1][:, j::m] + carried
             behind.run()
             carried = total[0][:, j::m]
