@@ -228,13 +228,13 @@ def beside_a_bound():
 
 def counted_products(monkeypatch):
     """A list that has one more entry with each product of a Hessian and a direction."""
-    products, applied = [], curvature._applied
+    products, made = [], curvature.product_along
 
-    def counted(product, given):
-        once = applied(product, given)
-        return lambda direction: products.append(1) or once(direction)
+    def counted(*given):
+        once, *others = made(*given)
+        return lambda direction: products.append(1) or once(direction), *others
 
-    monkeypatch.setattr(curvature, "_applied", counted)
+    monkeypatch.setattr(curvature, "product_along", counted)
     return products
 
 

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 from covocp.base.matrices import half_length, pack, unpack
 from covocp.passage import library, ordering, sweep
-from covocp.passage.sweep import _Sweep, entries_of, passed_by
+from covocp.passage.shape import shape
+from covocp.passage.sweep import Course, _Sweep, entries_of, passed_by
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
@@ -69,6 +70,7 @@ def passages(monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity) -> list[ca.F
         monkeypatch.setattr(ordering, "LARGEST_SHARE", share)
         monkeypatch.setattr(ordering, "SMALLEST", 1)
         monkeypatch.setattr("covocp.passage.sweep._sweep", kept)
+        monkeypatch.setattr("covocp.passage.sweep.shape", shape.__wrapped__)  # it is remembered by the pattern alone
         wide = ca.repmat(pattern, 1, STEPS)
         arguments = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
         seeds, along = ca.MX.sym("s", half_length(n), STEPS), [ca.MX.sym("d", a.sparsity()) for a in arguments]
@@ -122,6 +124,55 @@ def test_slopes_and_their_tangents_are_those_with_exchanges_of_rows(monkeypatch,
     for one, other in zip(by_nonzeros(*given), exchanged(*given), strict=True):
         a, b = np.asarray(ca.DM(one).full()), np.asarray(ca.DM(other).full())
         assert np.abs(a - b).max() <= 1e-11 * np.abs(b).max()
+
+
+def few_seeds(n: int, rows: int, column: int) -> np.ndarray:
+    """Weights of all entries of some rows and columns of one of the covariances."""
+    rng, weights = np.random.default_rng(rows), np.zeros((n, n))
+    chosen = rng.choice(n, rows, replace=False)
+    weights[np.ix_(chosen, chosen)] = rng.normal(size=(rows, rows))
+    seeds = np.zeros((half_length(n), STEPS))
+    seeds[:, column] = pack(weights + weights.T)
+    return seeds
+
+
+@pytest.mark.parametrize("h", [0.02, 0.3, 2.5])
+@pytest.mark.parametrize(("n", "rows"), [(6, 1), (6, 2), (10, 2), (10, 3), (30, 1), (30, 2), (30, 7)])
+def test_tangents_of_slopes_by_few_entries_take_few_columns(monkeypatch, n, rows, h):
+    """In turn by other seeds, points and directions, of which each knows what the one before it left."""
+    pattern, given, _ = arguments(n, h)
+    wide = ca.repmat(pattern, 1, STEPS)
+    given[5:] = [ca.project(ca.DM(0.1 * k), wide) for k in points(n, h, seed=1, damping=0.7)]  # of the form of H
+    by_nonzeros, exchanged = passages(monkeypatch, pattern)
+    turns = [
+        given[:3] + [few_seeds(n, own, column), share * given[4], *given[5:]]
+        for own, column, share in ((rows, STEPS - 1, 1.0), (rows, STEPS - 1, -2.0), (1, 1, 1.0), (rows, 0, 0.5))
+    ]
+    turns.append([1.1 * given[0], *turns[0][1:]])
+    turns.append([*turns[0][:4], 0.0 * given[4], *given[5:]])
+    for turn in (*turns, turns[0]):
+        for one, other in zip(by_nonzeros(*turn), exchanged(*turn), strict=True):
+            a, b = np.asarray(ca.DM(one).full()), np.asarray(ca.DM(other).full())
+            assert np.abs(a - b).max() <= 1e-11 * np.abs(b).max()
+
+
+def test_steps_behind_the_only_seed_have_no_slopes_and_no_tangents_of_them():
+    """Whatever lies where they are written; without a node, by the passage that optimality takes."""
+    n, column = 30, 1
+    pattern, given, _ = arguments(n, 0.3)
+    entries = [np.asarray(ca.DM(k).nonzeros()).reshape(STEPS, -1).T for k in (*given[1:3], *given[5:])]
+    course = Course(given[0], entries[:2], n, tuple(map(tuple, pattern.get_triplet())), 1)
+    seeds = np.asfortranarray(few_seeds(n, 2, column))
+    by_first, slopes, passed = course.slopes(seeds)
+    moved = [np.full(entries[0].shape, np.nan, order="F") for _ in range(2)]
+    course.tangents(seeds, [np.asfortranarray(own) for own in entries[2:]], moved)
+    for found in (*slopes, *moved):
+        assert np.isfinite(found).all()
+        assert found[:, : column + 1].any(axis=0).all()
+        assert not found[:, column + 1 :].any()
+    np.testing.assert_array_equal(passed[:, column], seeds[:, column])
+    assert not passed[:, column + 1 :].any()
+    assert by_first.any()
 
 
 @pytest.mark.parametrize("share", [0.98, 1.0 - 1e-9, 1.0])
