@@ -145,7 +145,7 @@ def test_tangents_of_slopes_by_few_entries_take_few_columns(monkeypatch, n, rows
     given[5:] = [ca.project(ca.DM(0.1 * k), wide) for k in points(n, h, seed=1, damping=0.7)]  # of the form of H
     by_nonzeros, exchanged = passages(monkeypatch, pattern)
     turns = [
-        given[:3] + [few_seeds(n, own, column), share * given[4], *given[5:]]
+        [*given[:3], few_seeds(n, own, column), share * given[4], *given[5:]]
         for own, column, share in ((rows, STEPS - 1, 1.0), (rows, STEPS - 1, -2.0), (1, 1, 1.0), (rows, 0, 0.5))
     ]
     turns.append([1.1 * given[0], *turns[0][1:]])

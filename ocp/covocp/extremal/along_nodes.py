@@ -15,7 +15,6 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.dataclass import dataclass
-from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
@@ -23,9 +22,9 @@ from covocp.passage.columns import FEWEST, OnColumns, derivative_in_columns, num
 from covocp.passage.library import functions
 from covocp.passage.sweep import Course
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import KEPT, gauss_entries
+from covocp.transcription.covariance_steps import gauss_entries
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.numbers import by_themselves, columns_of_parts, turned
+from covocp.transcription.numbers import by_themselves, columns_of_parts
 from covocp.transcription.shooting import control_ends
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
@@ -35,7 +34,7 @@ LATER, DURATION = 5, 2
 
 
 class Slopes(NamedTuple):
-    """Costates at the nodes (N + 1, nx), slopes by the control values and by T, costates of the half-vectors (N + 1, ne)."""
+    """Costates at the nodes (N + 1, nx), slopes by control values and by T, costates of half-vectors (N + 1, ne)."""
 
     x: Array
     u: Array
@@ -44,14 +43,9 @@ class Slopes(NamedTuple):
 
 
 class Way(NamedTuple):
-    """A matrix on its way: its position, whether it runs backward, its steps in the order of travel.
+    """A matrix on its way: its entries among all half-vectors, the function of its steps' entries, its passage."""
 
-    function: the entries of its steps. course: it passes by them.
-    """
-
-    position: int
-    back: bool
-    steps: list[Array]
+    own: slice
     function: ca.Function
     course: Course
 
@@ -62,7 +56,6 @@ class AlongNodes:
 
     Attributes:
         statement, mesh, parameters: what is run.
-        end: x(T), T.
         steps: states at both ends of each substep and what `Interval` has, a column each.
         ways: the matrices.
     """
@@ -70,7 +63,6 @@ class AlongNodes:
     statement: Statement
     mesh: Mesh
     parameters: Array
-    end: tuple[Array, float]
     steps: list[Array]
     ways: tuple[Way, ...]
 
@@ -95,39 +87,27 @@ class AlongNodes:
             moved[:, :, k] = ahead(*(unit[part, None] for part in np.split(np.arange(unit.size), (nx, nx + nu)))).T
         return moved[:, :, :nx], moved[:, :, nx : nx + nu], moved[:, :, nx + nu :]
 
-    def slopes_by_end(self, weights: Array) -> tuple[Array, float]:
-        """Slopes by x(T) and T through what runs backward from there, of weights at the last node (ne,)."""
-        st = self.statement
-        if not st.behind:
-            return np.zeros(st.nx), 0.0
-        by_x, by_duration = _end_slopes(st)(*self.end, self.parameters, weights[st.entries(st.behind)])
-        return np.asarray(by_x.full()).ravel(), float(by_duration)
-
-    def slopes_at_end(self, weights: Array) -> Array:
-        """Slopes of weighed half-vectors by x(T)."""
-        return self.slopes_by_end(Seeds.of(self, weights).kicks[-1])[0]
-
     def costates(self, weights: Array, last: Array, jumps: Array, restarts: tuple[Array, Array]) -> Slopes:
         """Costates of the states at the nodes and of the half-vectors; slopes of the Lagrangian by controls and T.
 
         Args:
             weights: of the half-vectors at the nodes, (N + 1, ne).
-            last: costate at the end, (nx,), without what x(T) does through the matrices that start there.
+            last: costate at the end, (nx,).
             jumps: what is added at the nodes, (N + 1, nx).
             restarts: which costates to keep at the ends of the intervals (1 or 0) and what stands in place of the
                 others, (nx, N).
         """
         seeds, (keep, known) = Seeds.of(self, weights), restarts
-        own, (by_end, duration) = Backward.of(self, seeds).x, self.slopes_by_end(seeds.kicks[-1])
+        own = Backward.of(self, seeds).x
         through, n = self.transitions[0].transpose(0, 2, 1), self.mesh.intervals
         result, after = np.empty((n + 1, last.size)), np.empty((n, last.size))
-        result[n] = value = last + by_end
+        result[n] = value = last
         for k in range(n - 1, -1, -1):
             after[k] = keep[:, k] * value + known[:, k]
             result[k] = value = through[k] @ after[k] + own[k] + jumps[k]
         found = Backward.of(self, seeds, after)
         by_u = by_controls(self.mesh, found.begin, found.end)
-        return Slopes(result, by_u, found.duration + seeds.duration + duration, seeds.kicks)
+        return Slopes(result, by_u, found.duration + seeds.duration, seeds.kicks)
 
 
 def along_nodes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array) -> AlongNodes | None:
@@ -140,7 +120,8 @@ def along_nodes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
         parameters: of the statement.
 
     Returns:
-        None where the library cannot take the model or its steps, or where running costs depend on the matrices.
+        None where the library cannot take the model or its steps, where running costs depend on the matrices, or where
+        some of these run backward.
     """
     return _along_nodes(statement, mesh, trajectory, tuple(parameters.tolist()))
 
@@ -151,7 +132,8 @@ def _along_nodes(
 ) -> AlongNodes | None:
     st, t, parameters, n, m = statement, trajectory, np.array(given), mesh.intervals, mesh.substeps
     plain = st.nominal is not None and mesh.step != "rodas" and functions() is not None and n * m >= FEWEST
-    if not plain or st.running_uses_matrices or (st.matrices and not by_themselves(st, mesh)):
+    others = st.running_uses_matrices or st.behind or (st.matrices and not by_themselves(st, mesh))
+    if not plain or others:
         return None
     columns, advance = columns_of_parts(mesh, m, t.u.T, t.duration, parameters), nominal_interval(st, 1, mesh.step)
     found = numbers_in_turn(st, advance, t.x[:n].T, columns, m)
@@ -160,15 +142,13 @@ def _along_nodes(
     before = np.empty((n, m, st.nx))
     before[:, 0], before[:, 1:] = t.x[:n], found[0].T.reshape(n, m, -1)[:, :-1]
     steps = [np.asfortranarray(values) for values in (before.reshape(n * m, -1).T, found[0], *columns)]
-    back = [np.asfortranarray(values) for values in turned(steps, slice(None, None, -1))] if st.behind else []
-    ways = [_way(st, mesh, i, t.e[0], steps) for i in st.ahead] + [_way(st, mesh, i, t.e[-1], back) for i in st.behind]
+    ways = [_way(st, mesh, i, t.e[0], steps) for i in st.ahead]
     if any(way is None for way in ways):
         return None
     return AlongNodes(
         statement=st,
         mesh=mesh,
         parameters=parameters,
-        end=(t.x[-1], t.duration),
         steps=steps,
         ways=tuple(way for way in ways if way is not None),
     )
@@ -181,17 +161,7 @@ def _way(statement: Statement, mesh: Mesh, position: int, first: Array, steps: l
     if points is None or derivative_in_columns(statement, function, "reverse") is None:
         return None
     course = Course(first[block.span], points, block.size, pattern, mesh.substeps)
-    return Way(position, block.backward, steps, function, course)
-
-
-@lru_cache(maxsize=KEPT)
-def _end_slopes(statement: Statement) -> ca.Function:
-    """(x(T), T, parameters, weights) -> slopes by x(T) and T of the half-vectors that start there, weighed."""
-    assert statement.matrix_end is not None
-    symbols = [ca.MX.sym("x", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)]
-    weights = ca.MX.sym("weights", len(statement.entries(statement.behind)))
-    slopes = slopes_by(ca.dot(weights, statement.matrix_end(*symbols)), symbols[:2])
-    return ca.Function("end_slopes", [*symbols, weights], slopes)
+    return Way(block.span, function, course)
 
 
 def derived(statement: Statement, function: ca.Function, *kinds: str) -> OnColumns:
@@ -210,7 +180,7 @@ class Seeds:
         begin, end: by the controls there.
         duration: by T.
         kicks: costates of the half-vectors, (N + 1, ne).
-        entries: of each matrix, its weights in the order of travel, and slopes by its entries at both points.
+        entries: of each matrix, its weights, and slopes by its entries at both points.
     """
 
     before: Array
@@ -227,21 +197,18 @@ class Seeds:
         st, kicks, steps = along.statement, weights.copy(), along.steps
         total, duration, entries = [np.zeros_like(values) for values in steps[:4]], 0.0, []
         for way in along.ways:
-            own, order = st.matrices[way.position].span, slice(None, None, -1 if way.back else 1)
-            given = weights[order, own]
+            given = weights[:, way.own]
             seeds = np.asfortranarray(given[1:].T)
             start, points, passing = way.course.slopes(seeds)
             entries.append((seeds, points))
-            kicks[order, own] = np.vstack([given[0] + start, passing.T])
+            kicks[:, way.own] = np.vstack([given[0] + start, passing.T])
             nothing = [np.zeros(0)] * 2
-            by = derived(st, way.function, "reverse").of_numbers([*way.steps, *nothing, *points], steps[0].shape[1])
-            for result, slopes in zip(total, (1, 0, 3, 2) if way.back else range(4), strict=True):
-                result += by[slopes][:, order]
+            by = derived(st, way.function, "reverse").of_numbers([*steps, *nothing, *points], steps[0].shape[1])
+            for result, slopes in zip(total, by, strict=False):
+                result += slopes
             duration += float(by[4 + DURATION].sum())
         before, after, begin, end = total
-        return Seeds(
-            before=before, after=after, begin=begin, end=end, duration=duration, kicks=kicks, entries=entries
-        )
+        return Seeds(before=before, after=after, begin=begin, end=end, duration=duration, kicks=kicks, entries=entries)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -329,16 +296,13 @@ class Ahead:
 
 
 class Hessian:
-    """The Hessian of running cost, weighed half-vectors and continuity, by nodes and controls, times directions.
-
-    Where a matrix runs backward its half-vectors at the end move with x(T): that is not seen.
-    """
+    """The Hessian of running cost, weighed half-vectors and continuity, by nodes and controls, times directions."""
 
     def __init__(self, along: AlongNodes, weights: Array, costates: Array) -> None:
         """Prepare it.
 
         Args:
-            along: whose steps they are; no matrix runs backward.
+            along: whose steps they are.
             weights: of the half-vectors at the nodes, (N + 1, ne).
             costates: of the states after the intervals, (N, nx).
         """
@@ -356,9 +320,7 @@ class Hessian:
             adjoint = [*along.at(j), *unread, seeds[j], None, cost, *([None] * (3 + LATER))]
             behind = back.prepared([*adjoint, moved, begin, end, *still, *unread, seed, None, None], n)
             self._nominal.append((seed, behind))
-        self._ways = [
-            _Moved(along, way, self._moved, *own) for way, own in zip(along.ways, given.entries, strict=True)
-        ]
+        self._ways = [_Moved(along, way, self._moved, *own) for way, own in zip(along.ways, given.entries, strict=True)]
 
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array]:
         """The product with a direction of the states at the nodes (N + 1, nx) and of the control values, likewise."""
@@ -389,16 +351,14 @@ class Hessian:
 class _Moved:
     """Tangents of the slopes of weighed half-vectors by the steps of one matrix."""
 
-    def __init__(
-        self, along: AlongNodes, way: Way, moved: Sequence[Array], seeds: Array, points: list[Array]
-    ) -> None:
+    def __init__(self, along: AlongNodes, way: Way, moved: Sequence[Array], seeds: Array, points: list[Array]) -> None:
         """Prepare them for steps that move by what lies in `moved`: states and controls at both ends of each."""
-        st, count = along.statement, way.steps[0].shape[1]
+        st, count = along.statement, along.steps[0].shape[1]
         still, unread = [None] * LATER, [None] * 2
         self._course, self._seeds = way.course, seeds
-        self._ahead = derived(st, way.function, "forward").prepared([*way.steps, *unread, *moved, *still], count)
+        self._ahead = derived(st, way.function, "forward").prepared([*along.steps, *unread, *moved, *still], count)
         self._slopes = [np.zeros_like(values, order="F") for values in points]
-        adjoint = [*way.steps, *unread, *points, *([None] * (4 + LATER))]
+        adjoint = [*along.steps, *unread, *points, *([None] * (4 + LATER))]
         self._back = derived(st, way.function, "reverse", "forward").prepared(
             [*adjoint, *moved, *still, *unread, *self._slopes], count
         )

@@ -191,8 +191,7 @@ def without_passage(extremal: Extremal) -> Extremal:
     weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)
     weights[-1, behind] -= m.final_matrices[behind]
-    along = along_nodes(st, fine.mesh, fine.trajectory, fine.parameters)
-    through = _through_passages(fine, weights)[0][-1] if along is None else along.slopes_at_end(weights)
+    through = _through_passages(fine, weights)[0][-1]
     return replace(extremal, multipliers=replace(m, final=m.final - through))
 
 

@@ -39,12 +39,12 @@ class _Pattern(NamedTuple):
     @property
     def among_rows(self) -> list[int]:
         """Positions of the rows among the different ones."""
-        return np.searchsorted(self.own_rows, self.rows).tolist()
+        return [self.own_rows.index(row) for row in self.rows]
 
     @property
     def among_columns(self) -> list[int]:
         """The same of the columns."""
-        return np.searchsorted(self.own_columns, self.columns).tolist()
+        return [self.own_columns.index(column) for column in self.columns]
 
 
 class _Form(NamedTuple):
@@ -65,7 +65,8 @@ def has_forms(statement: Statement) -> bool:
 def _form(statement: Statement, position: int) -> _Form:
     form = statement.riccati[position]
     assert form is not None
-    symbols = [statement.symbolic.sym(form.name_in(i), form.size1_in(i)) for i in range(form.n_in())]
+    symbolic: Any = statement.symbolic
+    symbols = [symbolic.sym(form.name_in(i), form.size1_in(i)) for i in range(form.n_in())]
     parts = form.call(symbols)
     entries = [ca.sparsity_cast(part, ca.Sparsity.dense(part.nnz(), 1)) for part in parts]
     places = [part.sparsity().get_triplet() for part in parts]
@@ -79,7 +80,8 @@ def _nominal_slopes(statement: Statement) -> ca.Function:
     """(x, u, t, T, parameters) -> f_x column by column, L_x."""
     nominal = statement.nominal
     assert nominal is not None
-    symbols = [statement.symbolic.sym(nominal.name_in(i), nominal.size1_in(i)) for i in range(nominal.n_in())]
+    symbolic: Any = statement.symbolic
+    symbols = [symbolic.sym(nominal.name_in(i), nominal.size1_in(i)) for i in range(nominal.n_in())]
     rate, cost = nominal.call(symbols)
     slopes = [ca.vec(ca.densify(ca.jacobian(rate, symbols[0]))), ca.densify(ca.gradient(cost, symbols[0]))]
     return ca.Function("nominal_slopes", symbols, slopes)
@@ -96,7 +98,8 @@ def costates_in_numbers(
         values: x and e at the starts, middles and ends of the steps, (N, 2 pairs + 1, nx + ne).
         last: costates at the end, (nx + ne,).
         jumps: what is added at the nodes, (N + 1, nx + ne).
-        restarts: which costates to keep at the ends of the intervals and what stands in place of the others, (nx + ne, N).
+        restarts: which costates to keep at the ends of the intervals and what stands in place of the others,
+            (nx + ne, N).
 
     Returns:
         None where the library cannot take the model.

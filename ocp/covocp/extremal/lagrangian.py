@@ -107,7 +107,7 @@ def second_order(
         value = ca.MX(0.0)
     else:
         common = interval_columns(mesh, u, duration, p)
-        e, seen, cost, ends = _passed(st, mesh, held, (z, e0, duration, p, none), common)
+        e, seen, cost, ends = _passed(st, mesh, held, (z, e0, p, none), common)
         value = ca.sum2(cost) + ca.dot(costate[:, 1:], ends - z[:, 1:])
         value += ca.dot(final_e, e[:, -1]) + ca.dot(matrices, e)
     value += st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(final, x[:, -1]) + ca.dot(states, x)
@@ -148,7 +148,7 @@ def _passed(
     statement: Statement, mesh: Mesh, held: Entries, at: tuple[Any, ...], common: Interval
 ) -> tuple[Any, Any, Any, Any]:
     """Half-vectors at the nodes, the same for rows that are held, running costs, and the nodes after the intervals."""
-    st, n, (z, e0, duration, p, none) = statement, mesh.intervals, at
+    st, n, (z, e0, p, none) = statement, mesh.intervals, at
     if st.coupled:
         ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
         return z[st.nx :, :], z[st.nx :, :], cost, ends
@@ -165,7 +165,7 @@ def _passed(
 
 
 class _Terminal(NamedTuple):
-    """What the form of the terminal cost tells: whether its slope by x(T) moves with it, that by half-vectors with any."""
+    """By form: whether the terminal cost's slope by x(T) moves with it, and that by half-vectors with any of both."""
 
     curved: bool
     bent: bool
@@ -173,7 +173,8 @@ class _Terminal(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _terminal(statement: Statement) -> _Terminal:
-    end, symbolic = statement.terminal, statement.symbolic
+    end = statement.terminal
+    symbolic: Any = statement.symbolic
     x, e, *others = (symbolic.sym(end.name_in(i), end.size1_in(i)) for i in range(end.n_in()))
     by_x, by_e = slopes_by(end(x, e, *others), (x, e))
     return _Terminal(bool(ca.depends_on(by_x, x)), bool(ca.depends_on(by_e, ca.vertcat(x, e))))
@@ -233,7 +234,7 @@ def _hessian(extremal: Extremal, costates: Costates, held: Entries) -> Hessian |
     st, m = extremal.statement, extremal.multipliers
     conditions: list[Conditions | Inside] = [st.path, st.start, st.end, st.inside]
     seen = any(kind.uses_matrices for kind in conditions if kind.size) or _sees_matrices(st, held)
-    if seen or st.behind or st.tied is not None:
+    if seen or st.tied is not None:
         return None
     weights, along = m.matrices.copy(), along_nodes(st, extremal.mesh, extremal.trajectory, extremal.parameters)
     if along is None:

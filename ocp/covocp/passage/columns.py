@@ -136,8 +136,8 @@ def derivative_in_columns(owner: Owner, function: ca.Function, *kinds: str) -> O
         if told is None:
             return None
         ends = told.outputs if kind == "reverse" else told.inputs
-        told, results = told.derived(kind, tuple(moving)), [True] * len(told.outputs)
-        moving = [*moving, *results, *([True] * len(ends))]
+        moved = [*moving, *([True] * (len(told.outputs) + len(ends)))]
+        told, moving = told.derived(kind, tuple(moving)), moved
     return told if told is not None and told.whole else None
 
 

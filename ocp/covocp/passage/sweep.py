@@ -173,9 +173,7 @@ class Course:
         points = [np.empty((sweep.entries, sweep.moves), order="F") for _ in range(2)]
         found = (array.ctypes.data for array in (start, *points))
         memory = _WORKSPACES.take(sweep)
-        failed = needed()["passage_reverse"](
-            memory, *self._places, seeds.ctypes.data, *found, None, kicks.ctypes.data
-        )
+        failed = needed()["passage_reverse"](memory, *self._places, seeds.ctypes.data, *found, None, kicks.ctypes.data)
         _WORKSPACES.give(sweep, memory)
         if failed:
             raise MemoryError(f"no memory for the slopes of {sweep.count} steps")

@@ -1,0 +1,149 @@
+"""Slopes and Hessians along known nodes, by numbers in the compiled library: against CasADi's of the same steps."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+import random_problems
+from vehicles import vehicle
+
+import covocp as co
+from covocp.extremal import costates, lagrangian
+from covocp.extremal.active_constraints import held_by
+from covocp.extremal.adjoint_steps import explicit_pairs
+from covocp.extremal.along_nodes import along_nodes
+from covocp.extremal.costates import discrete_costates, integrated_costates
+from covocp.extremal.costates_in_numbers import has_forms
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import refined
+from covocp.models import bryson_denham, mass_chain, unknown_lag
+from covocp.passage import library
+
+pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
+
+
+def own_rates() -> co.Problem:
+    """A matrix with rates of its own that depend on state and control; free duration, a state limit, a path limit."""
+    ocp = co.Problem(duration=co.Free(3.0, lower=1.0, upper=6.0), name="two")
+    x, v = ocp.state("x", initial=0.0, final=2.0), ocp.state("v", initial=0.0, upper=1.5)
+    u = ocp.control("u", lower=-3.0, upper=3.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.1 * v**3)
+    P = ocp.symmetric("P", 2, initial=[[1.0, 0.1], [0.1, 0.5]])
+    F = ca.blockcat([[-0.3, 1.0], [-ca.exp(-x), -0.2 - 0.1 * v**2]])
+    ocp.dynamics(P, F @ P + P @ F.T + ca.diag(ca.vertcat(0.1, 0.2 + u**2)))
+    ocp.subject_to(v * x, upper=5.0)
+    ocp.minimize(running=0.1 + 0.5 * u**2, terminal=P[0, 0] + 0.3 * P[0, 1] + 0.1 * x * v)
+    return ocp
+
+
+def turning() -> co.Problem:
+    """An attitude whose error is estimated."""
+    ocp = co.Problem(duration=2.0, name="turning")
+    w, u = ocp.state("w", 3, initial=0.0, variance=0.1), ocp.control("u", 3, guess=[0.1, -0.2, 0.05])
+    q = ocp.attitude("q", initial=[1.0, 0.0, 0.0, 0.0], rate=w, variance=0.1, noise=0.01)
+    ocp.dynamics(w, u - ca.cross(w, ca.DM([1.0, 2.0, 0.5]) * w), noise=0.1)
+    ocp.measurement("star", q.matrix[:, 0], noise=0.01)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * ca.sumsqr(u), terminal=E[w[0], w[0]] + 3.0 * E[w[2], w[2]])
+    return ocp
+
+
+PROBLEMS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "chain": (lambda: mass_chain.problem(masses=2), {}),
+    "many masses": (lambda: mass_chain.problem(masses=14), {}),
+    "substeps": (lambda: mass_chain.problem(masses=2), {"substeps": 3}),
+    "constant": (unknown_lag.problem, {"control": "constant", "substeps": 2}),
+    "limits": (bryson_denham.problem, {}),
+    "limits inside": (bryson_denham.problem, {"points": 4}),
+    "vehicle": (lambda: vehicle(8.0, 0.5, 1.0, beacon=True), {}),
+    "two": (own_rates, {}),
+    "turning": (turning, {}),
+    **{f"random {seed}": (lambda seed=seed: random_problems.draw(seed).problem, {}) for seed in (2, 4, 6, 7, 9)},
+}
+
+
+@pytest.fixture(params=PROBLEMS)
+def extremal(request: pytest.FixtureRequest) -> Extremal:
+    """Nodes that no run joins, with multipliers of everything."""
+    make, options = PROBLEMS[request.param]
+    options = {"intervals": 34, "max_iterations": 0, "allow_failure": True, "progress": False} | options
+    found = co.solve(make(), **options).extremal
+    rng = np.random.default_rng(len(request.param))
+    t, m = found.trajectory, found.multipliers
+
+    def near(values: np.ndarray) -> np.ndarray:
+        return np.asarray(values + 0.05 * np.abs(values).max(initial=0.1) * rng.normal(size=values.shape))
+
+    weights = {own.name: 0.3 * rng.normal(size=np.shape(getattr(m, own.name))) for own in fields(m)}
+    return replace(found, trajectory=replace(t, x=near(t.x), u=near(t.u)), multipliers=replace(m, **weights))
+
+
+def without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By CasADi from here on."""
+    for module in (costates, lagrangian):
+        monkeypatch.setattr(module, "along_nodes", lambda *_: None)
+    discrete_costates.cache_clear()
+
+
+def alike(one: np.ndarray, other: np.ndarray, allowed: float = 1e-10) -> None:
+    """To roundoff of the largest entry."""
+    assert np.shape(one) == np.shape(other)
+    assert np.abs(one - other).max(initial=0.0) <= allowed * np.abs(other).max(initial=0.0)
+
+
+def test_costates_and_slopes_are_those_of_casadi(extremal: Extremal, monkeypatch: pytest.MonkeyPatch) -> None:
+    fine = refined(extremal)
+    assert along_nodes(fine.statement, fine.mesh, fine.trajectory, fine.parameters) is not None
+    own, by_controls, by_duration = discrete_costates(extremal)
+    without(monkeypatch)
+    other, known, duration = discrete_costates(extremal)
+    alike(own.state, other.state)
+    alike(own.matrices, other.matrices)
+    alike(by_controls, known)
+    assert by_duration == pytest.approx(duration, rel=1e-9)
+
+
+def test_slopes_of_intervals_are_those_of_casadi(extremal: Extremal, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = lagrangian.slopes_of_intervals(extremal)
+    without(monkeypatch)
+    for one, other in zip(own, lagrangian.slopes_of_intervals(extremal), strict=True):
+        alike(one, other)
+
+
+def test_products_are_those_of_casadi(extremal: Extremal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Hessian of the Lagrangian times directions of all nodes and controls, one after the other."""
+    fine = refined(extremal)
+    fine = replace(fine, multipliers=replace(fine.multipliers, matrices=np.zeros_like(fine.multipliers.matrices)))
+    held = held_by(fine, extremal.mesh.points)
+    fine = held.bare(fine)
+    given = discrete_costates(fine)[0]
+    assert lagrangian._hessian(fine, given, held.entries) is not None
+    product = lagrangian.product_along(fine, given, held.entries)[0]
+    without(monkeypatch)
+    known = lagrangian.product_along(fine, given, held.entries)[0]
+    rng = np.random.default_rng(0)
+    size = lagrangian.node_size(fine.statement) * (fine.mesh.intervals + 1) + fine.trajectory.u.size
+    for direction in (*rng.normal(size=(3, size)), np.zeros(size), np.eye(1, size)[0]):
+        alike(product(direction), known(direction))
+
+
+def test_integrated_costates_are_those_of_the_slopes_of_h(monkeypatch: pytest.MonkeyPatch, extremal: Extremal) -> None:
+    """Both of order four in the length of the steps, with the same impulses and restarts."""
+    assert has_forms(extremal.statement)
+    needed, first = explicit_pairs(extremal)
+    with np.errstate(over="ignore", invalid="ignore"):  # before the first node that explicit steps reach
+        own = [integrated_costates(extremal, times * needed) for times in (2, 4, 8)]
+    monkeypatch.setattr(costates, "has_forms", lambda _: False)
+    known = integrated_costates(extremal, 24 * needed)
+    for place in ("state", "matrices"):
+        exact = getattr(known, place)[first:]
+        size = np.abs(exact).max(initial=1e-300)
+        errors = [np.abs(getattr(one, place)[first:] - exact).max(initial=0.0) / size for one in own]
+        assert errors[2] <= 1e-5
+        assert all(fine <= max(before / 10.0, 1e-9) for before, fine in pairwise(errors))
