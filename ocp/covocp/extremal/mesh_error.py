@@ -37,6 +37,8 @@ FAR, MANY_PARTS = 0.05, 16
 STEP_ROUNDOFF = 1e-13
 # Change of what is at a node by halving the steps, relative to its range, that is told.
 LONG_STEPS = 1e-2
+# Such a change of segments by themselves from which on matrices are looked at along one run of the nominal, too.
+CLOSELY = 1e-3
 # Largest such change that default steps leave along a nominal, and where the nominal is optimised: shorter steps would
 # make that two to four times slower (chains of masses), and the cost has fewer digits than the nodes.
 ALONG, OPTIMISED = 1e-4, 2e-3
@@ -241,7 +243,7 @@ def _magnitudes(statement: Statement, trajectory: Trajectory, parameters: tuple[
     return magnitudes(statement, trajectory, np.array(parameters))
 
 
-def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
+def node_error(extremal: Extremal, gaps: Array | float = 0.0, *, closely: bool = True) -> float:
     """Largest change of a state or of an entry of a matrix at a node by halving the steps, relative to its range.
 
     At the end of a covariance it is relative to the product of its own deviations, where that is more.
@@ -254,32 +256,37 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
         extremal: the trajectory.
         gaps: at the ends of the segments with its own steps, (segments, variables there): those of a guess, along which
             nothing is amplified.
+        closely: False where it shall be known well from a hundredth on alone: what the nominal's drift makes of the
+            matrices, some times as much as what segments by themselves show, is then left out where these show little.
 
     Returns:
         The largest of them; inf where a run along the controls diverges, nan where the segments do.
     """
-    error = _by_halves(extremal, gaps)
+    error = _by_halves(extremal, gaps, closely=closely)
     hidden = None if np.any(gaps) else unseen(extremal)
     return error if hidden is None else float(np.maximum(error, hidden.moved))
 
 
-def _by_halves(extremal: Extremal, gaps: Array | float) -> float:
+def _by_halves(extremal: Extremal, gaps: Array | float, *, closely: bool = False) -> float:
     """`node_error` by halves of the steps alone."""
     moved, size = by_segments(extremal, gaps)
     with np.errstate(over="ignore", invalid="ignore"):
-        left = None if np.any(gaps) else _departure(extremal, moved, size)
+        matrices = closely or float((moved / size).max(initial=0.0)) > CLOSELY
+        left = None if np.any(gaps) else _departure(extremal, moved, size, matrices=matrices)
         if left is not None:
-            moved[: left.states.size] = left.states
-            if left.matrices is not None:
-                moved[left.states.size :] = np.maximum(moved[left.states.size :], left.matrices)
+            nx = left.states.size
+            moved[:nx] = left.states
+            if left.matrices is not None and left.end is not None:
+                least = ROUNDOFF * _magnitudes_of(extremal).max(initial=0.0)
+                end = left.end / np.maximum(final_deviations(extremal.statement, extremal.trajectory.e), least)
+                moved[nx:] = np.maximum(moved[nx:], np.maximum(left.matrices, end * size[nx:]))
         return float((moved / size).max(initial=0.0))
 
 
 def by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tuple[Array, Array]:
     """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
     t, finer = extremal.trajectory, parted(extremal, parts)
-    scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
-    magnitude = np.concatenate([scales.x, scales.e])
+    magnitude, values = _magnitudes_of(extremal), np.hstack([t.x, t.e])
     rounded = ROUNDOFF * magnitude.max(initial=0.0)
     size = np.maximum(np.ptp(values, axis=0), np.maximum(LEAST_RANGE * magnitude, rounded))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -291,9 +298,15 @@ def by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tupl
     return total, size
 
 
-def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
+def _magnitudes_of(extremal: Extremal) -> Array:
+    """Magnitudes of states and half-vectors, (nx + ne,)."""
+    scales = _magnitudes(extremal.statement, extremal.trajectory, tuple(extremal.parameters.tolist()))
+    return np.concatenate([scales.x, scales.e])
+
+
+def _departure(extremal: Extremal, moved: Array, size: Array, *, matrices: bool = False) -> Departure | None:
     nx = extremal.statement.nx
-    return departure(extremal, moved[:nx], size[:nx])
+    return departure(extremal, moved[:nx], size[:nx], matrices=matrices)
 
 
 def is_lost(extremal: Extremal, left: Array) -> bool:

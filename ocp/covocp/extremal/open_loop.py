@@ -31,18 +31,20 @@ class Departure:
 
     Attributes:
         states: largest distance of each state, (nx,); inf where the run diverges.
-        matrices: of each half-vector, (ne,); None where the plant amplifies nothing, which is not looked at then.
+        matrices: of each half-vector, (ne,); None where the plant amplifies nothing, unless that is asked for.
+        end: distance of each half-vector at the end, likewise.
         cost: of the run; None where the plant amplifies nothing.
     """
 
     states: Array
     matrices: Array | None
+    end: Array | None
     cost: float | None
 
     __repr__ = short_repr
 
 
-def departure(extremal: Extremal, by_segments: Array, size: Array) -> Departure | None:
+def departure(extremal: Extremal, by_segments: Array, size: Array, *, matrices: bool = False) -> Departure | None:
     """How one run along the controls leaves the nodes; None where that says nothing new.
 
     It does not with one segment, or where a feedback holds the nominal: then the controls are not flown alone.
@@ -51,6 +53,8 @@ def departure(extremal: Extremal, by_segments: Array, size: Array) -> Departure 
         extremal: the trajectory.
         by_segments: what the segments by themselves are off, all together, of each state, (nx,).
         size: ranges of the states, (nx,).
+        matrices: whether these are asked for where the plant amplifies nothing, too: they pass along a nominal that
+            drifts all the way, and at the end they are to be known to what is left of them.
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     if len(mesh.segments) == 1 or not st.nx or is_fed_back(st):
@@ -60,11 +64,14 @@ def departure(extremal: Extremal, by_segments: Array, size: Array) -> Departure 
         whole = _whole(st, mesh, t, parameters) if st.coupled else None
         x = nominal_along(extremal) if whole is None else whole.states
         states = _largest(x - t.x)
-        if not (states > np.maximum(AMPLIFIES * by_segments, SEEN * size)).any():
-            return Departure(states=states, matrices=None, cost=None)
+        amplified = bool((states > np.maximum(AMPLIFIES * by_segments, SEEN * size)).any())
+        if not amplified and not (matrices and st.ne):
+            return Departure(states=states, matrices=None, end=None, cost=None)
         whole = _whole(st, mesh, t, parameters) if whole is None else whole
         end = float(st.terminal(whole.states[-1], whole.matrices[-1], t.duration, extremal.parameters))
-    return Departure(states=states, matrices=_largest(whole.matrices - t.e), cost=whole.running + end)
+    left = whole.matrices - t.e
+    cost = whole.running + end if amplified else None
+    return Departure(states=states, matrices=_largest(left), end=_largest(left[-1:]), cost=cost)
 
 
 def is_fed_back(statement: Statement) -> bool:

@@ -35,6 +35,8 @@ from covocp.statement.interval import model_symbols
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
 
+# Share of a bound of T within which T may be held by it.
+BESIDE = 0.05
 # A stationarity above which it is asked what it does to the cost.
 LARGE_SLOPE = 1e-5
 # Terms of H over the time, in the duality gap, up to which they are those of multipliers that the solver left.
@@ -375,10 +377,12 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
     moved = mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
     residual = slope + float(values[-1, 0]) - float(moved)
     bound = st.duration.lower if residual > 0 else st.duration.upper
-    distance, others = abs(trajectory.duration - bound), 0.0 if within is None else within.size
-    # close, or as close as the cost sees: solvers stay off a bound by what it costs them
-    near = distance <= ACTIVE * bound or distance * abs(residual) <= ACTIVE * (absolute_cost(extremal) + others)
-    if np.isfinite(bound) and near:
+    distance = abs(trajectory.duration - bound)
+    near = distance <= ACTIVE * bound < np.inf
+    if not near and distance <= BESIDE * bound < np.inf:  # as close as the cost sees: solvers stay off a bound by what it costs
+        cost = variable_cost(extremal) + (0.0 if within is None else within.variable)
+        near = distance * abs(residual) <= ACTIVE * cost
+    if near:
         residual = 0.0  # the bound holds what would go on
     return abs(residual) / max(float(values[:, 1].max()), abs(slope), float(np.finfo(float).tiny))
 

@@ -66,7 +66,7 @@ def mention_doubts(solution: Solution) -> None:
         warn_user(_coarse(solution, error))
     elif alone:
         pass  # said already, with what the steps are off at the nodes
-    elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
+    elif solution.statement is not None and (moved := node_error(solution.extremal, closely=False)) > LONG_STEPS:
         warn_user(
             f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
             "its range, or at the end of itself. Use more intervals or substeps."
