@@ -41,6 +41,8 @@ class Search:
         statement: of the problem.
         options: of its mesh.
         ready: makes the problem ready on the mesh of other `options`, by Ipopt.
+        reduced: the same by the reduced method, which gets on where Ipopt stalls beside controls that grow what they
+            move.
         guess: what was given as such.
         reporter: of iterations.
         slow: whether the method that ran takes much longer than Ipopt, which then compares on a fine mesh too.
@@ -50,6 +52,7 @@ class Search:
     statement: Statement
     options: Options
     ready: Callable[..., Prepared]
+    reduced: Callable[..., Prepared]
     guess: Given
     reporter: Progress
     slow: bool
@@ -83,6 +86,18 @@ def made_coarse(search: Search, outcome: Outcome) -> tuple[Prepared, Outcome] | 
     return (coarse, base[0]) if base is not None and base[0].converged else None
 
 
+def made_reduced(search: Search, outcome: Outcome, *, fine: bool = False) -> Prepared | None:
+    """The problem made ready for the reduced method on the coarse or fine mesh; None where that cannot take it."""
+    options = search.options
+    if not fine:
+        values = outcome.extremal.parameters
+        options = thinned(search.statement, options, search.prepared.mesh, values, COARSE) or options
+    try:
+        return search.reduced(options=options)
+    except (CovocpError, RuntimeError):  # CasADi's
+        return None
+
+
 def solved_finely(search: Search, found: Found, near: Trajectory, mesh: Mesh, told: Mapping[str, Any]) -> Found | None:
     """What a trajectory of the coarse mesh leads to on the mesh itself; None where that is no cheaper than the found.
 
@@ -97,6 +112,10 @@ def solved_finely(search: Search, found: Found, near: Trajectory, mesh: Mesh, to
     u = resampled(near.u, mesh, search.prepared.mesh)
     start = along(search.statement, search.prepared.mesh, values, near, u)
     again = run_from(search.prepared, values, start, search.reporter)
+    if again is not None and not again[0].converged and (reduced := made_reduced(search, outcome, fine=True)):
+        nearer = run_from(reduced, values, start, search.reporter)
+        if nearer is not None and nearer[0].converged:
+            again = run_from(search.prepared, values, nearer[0].extremal.trajectory, search.reporter)
     if again is None or not again[0].converged:
         return None
     if cost_of(again[0]) >= cost_of(outcome) - CHEAPER * abs(cost_of(outcome)):

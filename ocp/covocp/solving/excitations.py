@@ -9,6 +9,7 @@ one: so the found one is compared there with what is found from controls that sw
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache, partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from covocp.solving.coarse_search import (
     Search,
     along,
     made_coarse,
+    made_reduced,
     may_be_left,
     part,
     run_from,
@@ -37,6 +39,8 @@ MOST_ITERATIONS = 100
 SWINGS = ((2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0), (4, 1.0), (5, 1.0), (5, -1.0), (8, 1.0))
 # Share of the size of the found controls with which those begin: solvers begin within the bounds.
 WITHIN = 0.95
+# Share of the range of a control that the found one reaches at least where swings between its bounds are no others.
+FURTHER = 0.25
 # So many of those that are cheaper there are run on the mesh itself.
 MOST_TRIED = 2
 
@@ -77,16 +81,22 @@ def _cheaper(search: Search, outcome: Outcome, coarse: Prepared, base: Outcome) 
     values, begin = outcome.extremal.parameters, outcome.extremal.trajectory
     seen: list[Merit] = []
     found: list[Outcome] = []
-    for controls in _swings(statement, mesh, begin.u):
+    least, reduced = cost_of(base) - WORTH * abs(cost_of(base)), cache(partial(made_reduced, search, outcome))
+    for controls, far in _swings(statement, mesh, begin.u):
         if reporter.stop:
             return
         trajectory = along(statement, mesh, values, begin, controls)
         merit = merit_of(coarse, values, trajectory)
-        if np.isfinite(merit).all() and not any(alike(merit, other, abs(merit.cost)) for other in seen):
-            seen.append(merit)
-            run = run_from(coarse, values, trajectory, part(reporter, MOST_ITERATIONS))
-            found += [] if run is None or not run[0].converged else [run[0]]
-    least = cost_of(base) - WORTH * abs(cost_of(base))
+        if not np.isfinite(merit).all() or any(alike(merit, other, abs(merit.cost)) for other in seen):
+            continue
+        seen.append(merit)
+        cheap = merit.cost < least
+        if far and not cheap:
+            continue
+        run = run_from(coarse, values, trajectory, part(reporter, MOST_ITERATIONS))
+        if cheap and (run is None or not run[0].converged) and (other := reduced()) is not None:
+            run = run_from(other, values, trajectory, part(reporter, MOST_ITERATIONS))
+        found += [] if run is None or not run[0].converged else [run[0]]
     better = sorted((one for one in found if cost_of(one) < least), key=cost_of)
     kept: list[float] = []
     for one in better:
@@ -95,13 +105,19 @@ def _cheaper(search: Search, outcome: Outcome, coarse: Prepared, base: Outcome) 
             yield one.extremal.trajectory
 
 
-def _swings(statement: Statement, mesh: Mesh, u: Array) -> Iterator[Array]:
-    """Controls that switch evenly, each as often as another one, between what the found ones (rows, nu) reach."""
-    middle = u.mean(axis=0)
-    size = WITHIN * np.abs(u - middle).max(axis=0)
-    places = mesh.nodes[: mesh.control_nodes]
-    counts = sorted({count for count, _ in SWINGS})
-    for count, sign in SWINGS:
-        own = [counts[(counts.index(count) + i) % len(counts)] for i in range(statement.nu)]
-        waves = [sign * (1.0 - 2.0 * (np.floor(places * one) % 2)) for one in own]
-        yield np.clip(middle + size * np.stack(waves, axis=1), *statement.control_bounds)
+def _swings(statement: Statement, mesh: Mesh, u: Array) -> Iterator[tuple[Array, bool]]:
+    """Controls that switch evenly, each as often as another one, between what the found ones (rows, nu) reach.
+
+    Then between the bounds, where that is much further: whether it is so comes with each.
+    """
+    lower, upper = statement.control_bounds
+    middle, places = u.mean(axis=0), mesh.nodes[: mesh.control_nodes]
+    reached, counts = np.abs(u - middle).max(axis=0), sorted({count for count, _ in SWINGS})
+    ways = [(middle, reached, False)]
+    if (reached < FURTHER * (upper - lower)).any():
+        ways.append((0.5 * (lower + upper), 0.5 * (upper - lower), True))
+    for around, most, far in ways:
+        for count, sign in SWINGS:
+            own = [counts[(counts.index(count) + i) % len(counts)] for i in range(statement.nu)]
+            waves = [sign * (1.0 - 2.0 * (np.floor(places * one) % 2)) for one in own]
+            yield np.clip(around + WITHIN * most * np.stack(waves, axis=1), lower, upper), far

@@ -29,13 +29,12 @@ from covocp.solving import refining
 from covocp.solving.attempts import best_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Deterministic
+from covocp.solving.beside_found import beside_found
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
-from covocp.solving.coarse_search import Search
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
-from covocp.solving.excitations import otherwise_excited
 from covocp.solving.failure import failure, possible, with_stalled
 from covocp.solving.farther import in_larger_units
 from covocp.solving.from_best_gain import bounded_below, from_best, part
@@ -47,7 +46,6 @@ from covocp.solving.longer import from_longer
 from covocp.solving.loosened import PATIENCE
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
-from covocp.solving.other_durations import of_other_duration
 from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.other_starts import Falling, OtherStarts
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
@@ -251,7 +249,7 @@ class Solver(OtherStarts):
                     here, prepared = (self._solved, self._prepared.mesh, values), self._prepared
                     if self._patient:
                         prepared = self._ready(self._options, **self._patient)
-                    alone = partial(from_starts, prepared, values, make_guesses(*here, None), reporter)
+                    alone = partial(self._alone, prepared, values, reporter, assess=assess)
                     guesses = random_guesses(*here, starts, seed)
                     outcome, first = best_of(prepared, values, guesses, starts + 1, reporter, alone), None
                     if assess:
@@ -325,14 +323,22 @@ class Solver(OtherStarts):
         if prepared is not self._prepared:
             self._keep(self._options, prepared)
         outcome = off_the_limit(ready, self._prepared, outcome, *where)
-        if assess and first is None and not self._counted:
-            taken = self._own if self._by_ipopt else {}
-            coarse = partial(made_ready, "ipopt", self._solved, parameters=self._values, **taken)
-            here = partial(Search, prepared=self._prepared, statement=self._solved, options=self._options, ready=coarse)
-            search = here(guess=guess, reporter=reporter, slow=self._by == "gradient")
-            for looked in (of_other_duration, otherwise_excited):
-                outcome, start = looked(search, (outcome, start))
+        if assess and first is None:
+            outcome, start = self._beside((outcome, start), self._prepared, guess, reporter)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
+
+    def _alone(self, prepared: Prepared, values: Array, reporter: Progress, *, assess: bool) -> Any:
+        """What is found without random starts, and the start."""
+        guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
+        found = from_starts(prepared, values, guesses, reporter)
+        return self._beside(found, prepared, None, reporter) if assess else found
+
+    def _beside(self, found: tuple[Outcome, Guess], prepared: Prepared, guess: Given, reporter: Progress) -> Any:
+        """What was found, or a cheaper minimum that other starts lead to on a coarse mesh, and its start."""
+        if self._counted:
+            return found
+        ways = {"slow": self._by == "gradient", "own": self._own if self._by_ipopt else {}}
+        return beside_found(found, prepared, (self._solved, self._options, self._values), guess, reporter, **ways)
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
