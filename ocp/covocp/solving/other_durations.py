@@ -1,4 +1,4 @@
-"""Other durations of what learns, compared on a coarse mesh: with a free duration it has many minima.
+"""Other durations of what learns or is fed back, compared on a coarse mesh: with a free duration it has many minima.
 
 How often an experiment swings, or on which side of a beacon a vehicle turns, changes with the time it has, and each
 such way is a minimum of its own in the duration too: a solver that starts from a guess ends at the nearest one, which
@@ -32,7 +32,7 @@ ROUNDS, MOST_ITERATIONS = 6, 60
 
 
 def of_other_duration(search: Search, found: Found) -> Found:
-    """The cheaper minimum of another duration, where a problem that learns in a free duration has one.
+    """The cheaper minimum of another duration, where a problem that learns, or a loop, has one in a free duration.
 
     Args:
         search: what is at hand.
@@ -52,9 +52,12 @@ def of_other_duration(search: Search, found: Found) -> Found:
 
 
 def _may_have(statement: Statement) -> bool:
-    """Whether the duration is free, and what is learnt on the way is worth something."""
-    plain = statement.loop is None and not statement.behind and not statement.coupled
-    return statement.duration.free and plain and learns(statement, linked=False)
+    """Whether the duration is free, and a feedback or what is learnt on the way is worth something."""
+    return (
+        statement.duration.free
+        and not statement.coupled
+        and (statement.loop is not None or learns(statement, linked=False))
+    )
 
 
 def _cheapest(search: Search, coarse: Prepared, first: Outcome) -> Outcome | None:

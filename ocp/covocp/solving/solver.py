@@ -246,14 +246,7 @@ class Solver(OtherStarts):
         with evaluating(self.statement.name), starts_kept():
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 if isinstance(guess, str):
-                    here, prepared = (self._solved, self._prepared.mesh, values), self._prepared
-                    if self._patient:
-                        prepared = self._ready(self._options, **self._patient)
-                    alone = partial(self._alone, prepared, values, reporter, assess=assess)
-                    guesses = random_guesses(*here, starts, seed)
-                    outcome, first = best_of(prepared, values, guesses, starts + 1, reporter, alone), None
-                    if assess:
-                        outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
+                    outcome, first = self._from_many(values, (starts, seed), reporter, assess=assess), None
                 else:
                     own, given = self._problem, parameters or {}
                     started = partial(gain_first, self._best, own, self._solved, given, allow_failure=allow_failure)
@@ -327,18 +320,26 @@ class Solver(OtherStarts):
             outcome, start = self._beside((outcome, start), self._prepared, guess, reporter)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
-    def _alone(self, prepared: Prepared, values: Array, reporter: Progress, *, assess: bool) -> Any:
-        """What is found without random starts, and the start."""
-        guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
-        found = from_starts(prepared, values, guesses, reporter)
-        return self._beside(found, prepared, None, reporter) if assess else found
+    def _from_many(self, values: Array, drawn: tuple[int, int], reporter: Progress, *, assess: bool) -> Outcome:
+        """The best of what is found without random starts and of so many of these, with a seed."""
+        here, prepared = (self._solved, self._prepared.mesh, values), self._prepared
+        if self._patient:
+            prepared = self._ready(self._options, **self._patient)
+
+        def alone() -> tuple[Outcome, Guess]:
+            found = from_starts(prepared, values, make_guesses(*here, None), reporter)
+            return self._beside(found, prepared, None, reporter) if assess else found
+
+        outcome: Outcome = best_of(prepared, values, random_guesses(*here, *drawn), drawn[0] + 1, reporter, alone)
+        return away_from_saddle(self._prepared, outcome, values, reporter, None) if assess else outcome
 
     def _beside(self, found: tuple[Outcome, Guess], prepared: Prepared, guess: Given, reporter: Progress) -> Any:
         """What was found, or a cheaper minimum that other starts lead to on a coarse mesh, and its start."""
         if self._counted:
             return found
-        ways = {"slow": self._by == "gradient", "own": self._own if self._by_ipopt else {}}
-        return beside_found(found, prepared, (self._solved, self._options, self._values), guess, reporter, **ways)
+        slow, own = self._by == "gradient", self._own if self._by_ipopt else {}
+        problem = self._solved, self._options, self._values
+        return beside_found(found, prepared, problem, guess, reporter, slow=slow, own=own)
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
