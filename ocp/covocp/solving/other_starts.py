@@ -10,7 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from covocp.base.errors import CovocpError, SolveError
 from covocp.base.expressions import Given
@@ -26,6 +29,8 @@ from covocp.solving.gain_start import GainStart, beyond
 from covocp.solving.methods import method_options
 from covocp.solving.warm_start import Later
 from covocp.statement.statement import Statement
+from covocp.transcription.grading import graded
+from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -81,6 +86,11 @@ class OtherStarts(ClassicalRuns):
     _remade: bool
     _looked: bool
     _otherwise: bool
+    _ran: bool
+    _values: Array
+
+    def _laid_out(self) -> Options:
+        raise NotImplementedError
 
     def _from_guess(
         self, values: Array, gain_start: GainStart, guess: Given, reporter: Progress, *, assess: bool
@@ -96,10 +106,13 @@ class OtherStarts(ClassicalRuns):
         for a gain, whose other ways are limited by them.
         """
         outcome, first = self._from_guess(values, gain_start, guess, reporter, assess=assess)
-        if not isinstance(guess, Later | Solution) or self._counted or outcome.converged or reporter.stop:
+        if self._counted or outcome.converged or reporter.stop:
             return outcome, first
         if passed_at_the_start(outcome) or (reporter.limited and not self._otherwise):
             return outcome, first
+        if not isinstance(guess, Later | Solution):
+            same = partial(self._from_guess, values, gain_start, guess, assess=assess)
+            return self._anew(values, same, (outcome, first), reporter)
         from covocp.solution.report import OTHER_START
 
         outcome = with_stalled(outcome, reporter)  # of the iterations of this run, not of all together
@@ -123,7 +136,32 @@ class OtherStarts(ClassicalRuns):
         if self._prepared is not kept[1]:
             self._keep(*kept)
             self._looked = looked
-        return outcome, first
+        own = partial(self._from_guess, values, gain_start, None, assess=assess)
+        return self._anew(values, own, (outcome, first), reporter)
+
+    def _anew(self, values: Array, run: Callable[..., Found], failed: Found, reporter: Progress) -> Found:
+        """Solve with mesh and units that are made for these values, where those for others led nowhere.
+
+        What is found so is what a solver would find that was made for them; it is kept for later runs.
+        """
+        if reporter.stop or reporter.limited or np.array_equal(values, self._values):
+            return failed
+        kept = self._options, self._prepared
+        before = self._values, self._asked, self._looked, self._first
+        try:
+            self._values, self._looked, self._ran = values, False, False
+            self._asked = with_instants(self.statement, graded(*self._ungraded, values), values)
+            options = self._laid_out()
+            self._keep(options, self._ready(options))
+            self._first = self._options, self._prepared
+            again: Found | None = run(reporter=reporter)
+        except (CovocpError, RuntimeError):  # the model has no values there; CasADi's
+            again = None
+        if again is not None and again[0].converged:
+            return with_stats(again[0], **counted(failed[0], again[0])), again[1]
+        self._values, self._asked, self._looked, self._first = before
+        self._keep(*kept)
+        return failed
 
     def _others(
         self, values: Array, gain_start: GainStart, guess: Later | Solution, reporter: Progress, *, assess: bool
