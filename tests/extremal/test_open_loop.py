@@ -118,3 +118,35 @@ def test_a_nominal_with_a_feedback_around_it_is_not_flown_alone():
     ocp.minimize_expected(running=0.5 * u**2 + x**2)
     solution = co.solve(ocp, progress=False)
     assert solution.optimality.node_error < 1e-2
+
+
+def spring(duration: float = 5.083) -> co.Problem:
+    """A free spring whose rate is known well, seen by its speed: its covariance falls to what long steps see."""
+    ocp = co.Problem(duration)
+    x, v = (ocp.state(name, initial=start, variance=9.2e-8) for name, start in (("x", 1.0), ("v", 0.0)))
+    k, u = ocp.unknown("k", mean=17.2, variance=0.1), ocp.control("u", lower=-3.0, upper=3.0, guess=0.1)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, -k * x - 0.1 * v + u, noise=1.02e-8)
+    ocp.measurement("m", v, noise=0.0127)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=1 + 0.5 * u**2 + 0.1 * x**2, terminal=0.01 * E[k, k])
+    return ocp
+
+
+def test_the_end_of_a_covariance_is_told_to_its_own_deviations_along_the_controls() -> None:
+    """The nominal drifts through all segments, and E with it: each by itself is off by a fifth of that."""
+    solution = co.solve(spring(), intervals=50, progress=False)
+    times, controls = solution.t, solution["u"].ravel()
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        u, E = np.interp(t, times, controls), y[2:].reshape(3, 3)
+        F = np.array([[0, 1, 0], [-17.2, -0.1, -y[0]], [0, 0, 0]])
+        change = F @ E + E @ F.T + np.diag([0, 1.02e-8, 0]) - np.outer(E[:, 1], E[1]) / 0.0127
+        return np.concatenate([[y[1], -17.2 * y[0] - 0.1 * y[1] + u], change.ravel()])
+
+    begin = np.concatenate([[1.0, 0.0], np.diag([9.2e-8, 9.2e-8, 0.1]).ravel()])
+    exact = solve_ivp(rate, (0.0, times[-1]), begin, rtol=1e-10, atol=1e-14, method="LSODA", max_step=0.1).y[2:, -1]
+    deviation = np.sqrt(np.diag(exact.reshape(3, 3)))
+    off = np.abs((solution["E"][-1] - exact.reshape(3, 3)) / np.outer(deviation, deviation)).max()
+    assert off > 5e-3
+    assert solution.optimality.node_error == pytest.approx(off, rel=0.2)

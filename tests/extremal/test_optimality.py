@@ -321,3 +321,42 @@ def test_a_free_duration_meets_its_condition_with_readings_and_limits_inside_the
     for share in (0.97, 1.03):
         fixed = co.solve(learning(share * best.duration), intervals=20, points=2, guess=best, progress=False)
         assert fixed.cost > best.cost
+
+
+@pytest.mark.parametrize("constant", [0.0, 1e3])
+def test_transversality_away_from_all_bounds_is_told_whatever_constants_cost(constant):
+    """What the tolerance leaves of it, as the slope of the costs of fixed durations says."""
+
+    def problem(duration):
+        ocp = co.Problem(duration)
+        x, v = ocp.state("x", initial=0.0, final=3.0), ocp.state("v", initial=0.0, final=0.0)
+        u = ocp.control("u", lower=-2.0, upper=2.0, guess=0.5)
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, u - 0.3 * v * ca.sqrt(v**2 + 0.01))
+        ocp.minimize(running=0.4 + 0.5 * u**2, terminal=constant)
+        return ocp
+
+    loose = co.solve(problem(co.Free(5.0, 2.0, 12.0)), intervals=40, tolerance=3e-2, progress=False)
+    T, step = loose.duration, 1e-2
+    costs = [co.solve(problem(T + s), intervals=40, tolerance=1e-9, progress=False).cost for s in (-step, step)]
+    slope = (costs[1] - costs[0]) / (2 * step)
+    assert abs(slope) > 1e-6
+    assert loose.optimality.transversality > 1e-7
+
+
+def test_transversality_is_zero_where_a_bound_holds_the_duration():
+    """Of which a solver stays a little off."""
+
+    def problem(upper):
+        ocp = co.Problem(co.Free(2.5, 2.0, upper))
+        x, v = ocp.state("x", initial=0.0, final=3.0), ocp.state("v", initial=0.0, final=0.0)
+        u = ocp.control("u", guess=0.5)
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, u)
+        ocp.minimize(running=0.4 + 0.5 * u**2)
+        return ocp
+
+    free = co.solve(problem(20.0), intervals=40, progress=False).duration
+    held = co.solve(problem(0.7 * free), intervals=40, progress=False)
+    assert held.duration == pytest.approx(0.7 * free, rel=1e-5)
+    assert held.optimality.transversality == 0.0

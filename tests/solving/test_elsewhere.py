@@ -236,3 +236,31 @@ def test_a_plan_that_goes_on_has_a_clock_that_goes_on(moved: bool) -> None:
     with pytest.warns(co.CovocpWarning, match="which begins at 0 again"):
         left = solver.solve(**start, progress=False)
     assert abs(spent + left.cost - plan.cost) > 0.05 * plan.cost
+
+
+def cart(angle: float) -> co.Problem:
+    """A cart whose pendulum, of unknown length, hangs at the end."""
+    ocp = co.Problem(4.0, "cart")
+    s = ocp.state("s", initial=0.0, final=1.0, variance=1e-3)
+    q = ocp.state("q", initial=angle, final=0.0, variance=1e-3)
+    vs, w = (ocp.state(name, initial=0.0, final=0.0, variance=1e-3) for name in ("vs", "w"))
+    length, a = ocp.unknown("l", mean=1.0, variance=0.04), ocp.control("a", lower=-6.0, upper=6.0, guess=0.1)
+    ocp.dynamics(s, vs)
+    ocp.dynamics(q, w)
+    ocp.dynamics(vs, a, noise=1e-3)
+    ocp.dynamics(w, (-9.81 * ca.sin(q) - a * ca.cos(q)) / length - 0.1 * w, noise=1e-3)
+    ocp.measurement("ms", s, noise=1e-3)
+    ocp.measurement("mq", q, noise=1e-3)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.05 * a**2, terminal=300.0 * E[length, length])
+    return ocp
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_what_a_new_solver_finds_is_found_after_solves_for_other_values(before):
+    """In the units of the first one the run ends where the conditions seem to contradict."""
+    fresh = co.solve(cart(3.0), intervals=50, progress=False)
+    solver = co.Solver(cart(0.0), intervals=50)
+    solver.solve(initial={"q": before}, progress=False)
+    assert solver.solve(initial={"q": 3.0}, progress=False).cost == pytest.approx(fresh.cost, rel=1e-6)
+    assert solver.solve(initial={"q": before}, progress=False).converged

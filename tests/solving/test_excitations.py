@@ -112,3 +112,45 @@ def test_a_control_without_bounds_is_not_looked_at() -> None:
     E = problem.estimation_covariance()
     problem.minimize(running=0.01 * u**2, terminal=E[a, a])
     assert "excited" not in co.solve(problem, progress=False).stats
+
+
+def decay() -> co.Problem:
+    """y' = -b y x with unknown b: seen well where x is negative, |x'| <= 1, and y grows; x ends at zero."""
+    problem = co.Problem(6.2)
+    x = problem.state("x", initial=0.73, final=0.0, variance=0.1)
+    y = problem.state("y", initial=0.5, variance=0.2)
+    b = problem.unknown("b", mean=2.5, variance=0.3)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, u, noise=0.02)
+    problem.dynamics(y, -b * y * x, noise=0.01)
+    problem.measurement("m", y, noise=0.0366)
+    E = problem.estimation_covariance()
+    problem.minimize(running=0.5 * u**2, terminal=85.0 * E[b, b])
+    return problem
+
+
+def cost_of_decay(times: np.ndarray, controls: np.ndarray) -> tuple[float, float]:
+    """Cost and x at the end along controls that are linear between these times, by scipy."""
+
+    def rates(t: float, z: np.ndarray) -> np.ndarray:
+        x, y, E = z[0], z[1], z[2:11].reshape(3, 3)
+        u = np.interp(t, times, controls)
+        F = np.array([[0, 0, 0], [-2.5 * y, -2.5 * x, -x * y], [0, 0, 0]])
+        change = F @ E + E @ F.T + np.diag([0.02, 0.01, 0]) - np.outer(E[:, 1], E[1]) / 0.0366
+        return np.concatenate([[u, -2.5 * y * x], change.ravel(), [0.5 * u**2]])
+
+    begin = np.concatenate([[0.73, 0.5], np.diag([0.1, 0.2, 0.3]).ravel(), [0.0]])
+    found = solve_ivp(rates, (0.0, 6.2), begin, method="LSODA", rtol=1e-8, atol=1e-11, max_step=0.05).y[:, -1]
+    return float(found[11] + 85.0 * found[10]), float(found[0])
+
+
+@pytest.mark.filterwarnings("ignore:The integration steps are long")  # y grows e^8-fold there, and its variance
+@pytest.mark.parametrize("intervals", [30, 60, 100])
+def test_the_side_that_tells_more_is_found_from_a_small_control_on_the_other(intervals: int) -> None:
+    """Full speed there and back is far from the controls of the dear minimum, and costs a fifth of it."""
+    times = np.linspace(0.0, 6.2, 621)
+    there, end = cost_of_decay(times, np.where(times < 0.5 * (6.2 + 0.73), -1.0, 1.0))
+    assert abs(end) < 0.02
+    found = co.solve(decay(), intervals=intervals, progress=False)
+    assert found.cost < there
+    assert cost_of_decay(found.t, found["u"])[0] == pytest.approx(found.cost, rel=1e-3)

@@ -110,3 +110,33 @@ def test_a_vehicle_does_not_stop_before_it_has_learnt() -> None:
     for guess in (4.0, 10.0):
         found = co.solve(vehicle(co.Free(guess, 0.2, 60.0)), intervals=INTERVALS, progress=False)
         assert found.cost <= fixed * 1.001
+
+
+def loop(duration: float | co.Free) -> co.Problem:
+    """A spring of unknown rate that is brought over and held under its feedback: two durations are minima."""
+    problem = co.Problem(duration, name="loop")
+    x = problem.state("x", initial=-3.0, final=1.0, variance=0.1)
+    v = problem.state("v", initial=0.0, final=0.0, variance=0.1)
+    b, u = problem.unknown("b", mean=1.8, variance=0.2), problem.control("u", lower=-4.0, upper=4.0, guess=0.1)
+    problem.dynamics(x, v)
+    problem.dynamics(v, u - b * x - 0.2 * v, noise=0.01)
+    problem.measurement("m", x, noise=0.0017)
+    problem.minimize_expected(running=0.3 + 0.5 * u**2 + 0.1 * x**2, terminal_weight={x: 3.0, v: 1.0})
+    return problem
+
+
+@pytest.mark.parametrize("guess", [2.5, 7.5, 10.0])
+def test_no_fixed_duration_of_a_loop_is_cheaper(guess: float) -> None:
+    durations = (2.1, 2.2, 2.3, 2.4, 3.0, 5.0, 6.4, 6.8, 7.2, 9.0)
+    costs = [co.solve(loop(T), intervals=40, progress=False).cost for T in durations]
+    assert costs[5] > 1.5 * max(costs[2], costs[7])  # between two minima
+    assert co.solve(loop(co.Free(guess, 2.0, 22.0)), intervals=40, progress=False).cost <= min(costs)
+
+
+@pytest.mark.parametrize("starts", [0, 3])
+def test_many_starts_are_no_worse_than_none(starts: int) -> None:
+    """They are tried beside what is found without them, other durations among that."""
+    solver = co.Solver(oscillator(co.Free(3.0, 0.2, 60.0)), intervals=INTERVALS)
+    alone = solver.solve(progress=False)
+    many = solver.solve(guess="multistart", starts=starts, progress=False)
+    assert many.cost <= alone.cost * (1.0 + 1e-7)
