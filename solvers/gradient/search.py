@@ -332,10 +332,14 @@ class Search:
         if size <= 0 or not np.isfinite(along):
             return
         control.raised = max(1.0, control.raised / RAISE)
-        if along > 0:
-            value = max(float(seen @ solve_tangent(plain, seen, after.rows, step.active)) / along, along / size)
-            control.weight = float(np.clip(value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
-        control.pairs = [*control.pairs[1 - PAIRS :], (change, damped(change, turned, metric @ change))]
+        with np.errstate(over="ignore", invalid="ignore"):
+            if along > 0:
+                value = max(float(seen @ solve_tangent(plain, seen, after.rows, step.active)) / along, along / size)
+                control.weight = float(np.clip(np.nan_to_num(value), SMALLEST_WEIGHT, LARGEST_WEIGHT))
+            learned = damped(change, turned, metric @ change)
+            known = np.isfinite(float(learned @ learned))
+        if known:  # slopes of a cost that has run away have squares that are no numbers
+            control.pairs = [*control.pairs[1 - PAIRS :], (change, learned)]
 
     def _record(self, current: Iterate, measures: Measures) -> None:
         worst = float(self.space.violation(current).max(initial=0.0))

@@ -400,3 +400,16 @@ def test_where_nothing_is_to_be_done_the_controls_are_zero(final, variant):
     assert solution.cost == 0.0
     assert not solution.controls.any()
     assert solution.stats["iterations"] <= 3
+
+
+def test_slopes_whose_squares_are_no_numbers_are_not_remembered():
+    """Where nothing is learnt yet of a squared distance, the curvature along a first step is that of a run-away cost."""
+    ocp = co.Problem(7.98583251431159)
+    x, z = ocp.state("x", initial=0.0, final=1.0, variance=0.1), ocp.unknown("z", mean=0.0, variance=0.5)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=0.05)
+    ocp.measurement("m", (x - z) ** 2, noise=0.010871872224233789)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * u**2, terminal=0.27190384789361033 * E[z, z])
+    found = co.solve(ocp, "gradient", intervals=30, progress=False)
+    assert found.cost == pytest.approx(co.solve(ocp, intervals=30, progress=False).cost, rel=1e-4)
