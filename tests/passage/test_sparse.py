@@ -20,6 +20,8 @@ pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.
 STEPS = 5
 ROWS, COUNT, EVERY = 10, 20, 2  # of the steps of which slopes of few entries are taken: in an interval two
 KEPT: list[_Sweep] = []
+# Largest share of an order of elimination, whether there are kicks.
+WAYS = ((1e9, False), (0.0, False))
 
 
 def kept(*given: object) -> _Sweep:
@@ -62,11 +64,16 @@ def prior(n: int, size: float = 1.0, units: float = 1.0) -> np.ndarray:
     return size * S @ (A @ A.T / n + np.eye(n)) @ S
 
 
-def passages(monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity) -> list[ca.Function]:
-    """The passage and its slopes and their tangents: by nonzeros, and with exchanges of rows."""
+def passages(
+    monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity, ways: tuple[tuple[float, bool], ...] = WAYS
+) -> list[ca.Function]:
+    """The passage and its slopes and their tangents: by nonzeros, and with exchanges of rows; or by other ways.
+
+    With kicks, which are zero here, all of dE is taken along.
+    """
     n = pattern.shape[0] // 2
     functions = []
-    for share in (1e9, 0.0):
+    for share, kicked in ways:
         monkeypatch.setattr(ordering, "LARGEST_SHARE", share)
         monkeypatch.setattr(ordering, "SMALLEST", 1)
         monkeypatch.setattr("covocp.passage.sweep._sweep", kept)
@@ -74,7 +81,8 @@ def passages(monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity) -> list[ca.F
         wide = ca.repmat(pattern, 1, STEPS)
         arguments = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
         seeds, along = ca.MX.sym("s", half_length(n), STEPS), [ca.MX.sym("d", a.sparsity()) for a in arguments]
-        after = passed_by(arguments[0], entries_of(arguments[1:], n))
+        kicks = ca.DM.zeros(half_length(n), STEPS) if kicked else None
+        after = passed_by(arguments[0], entries_of(arguments[1:], n), kicks)
         slopes = [ca.jtimes(after, a, seeds, True) for a in arguments]
         moved: list[ca.MX] = [
             sum((ca.jtimes(slope, a, d) for a, d in zip(arguments, along, strict=True)), ca.MX(0)) for slope in slopes
@@ -143,7 +151,7 @@ def test_tangents_of_slopes_by_few_entries_take_few_columns(monkeypatch, n, rows
     pattern, given, _ = arguments(n, h)
     wide = ca.repmat(pattern, 1, STEPS)
     given[5:] = [ca.project(ca.DM(0.1 * k), wide) for k in points(n, h, seed=1, damping=0.7)]  # of the form of H
-    by_nonzeros, exchanged = passages(monkeypatch, pattern)
+    *found, known = passages(monkeypatch, pattern, (*WAYS, (0.0, True)))
     turns = [
         [*given[:3], few_seeds(n, own, column), share * given[4], *given[5:]]
         for own, column, share in ((rows, STEPS - 1, 1.0), (rows, STEPS - 1, -2.0), (1, 1, 1.0), (rows, 0, 0.5))
@@ -151,9 +159,11 @@ def test_tangents_of_slopes_by_few_entries_take_few_columns(monkeypatch, n, rows
     turns.append([1.1 * given[0], *turns[0][1:]])
     turns.append([*turns[0][:4], 0.0 * given[4], *given[5:]])
     for turn in (*turns, turns[0]):
-        for one, other in zip(by_nonzeros(*turn), exchanged(*turn), strict=True):
-            a, b = np.asarray(ca.DM(one).full()), np.asarray(ca.DM(other).full())
-            assert np.abs(a - b).max() <= 1e-11 * np.abs(b).max()
+        expected = [np.asarray(ca.DM(values).full()) for values in known(*turn)]
+        for function in found:
+            for values, other in zip(function(*turn), expected, strict=True):
+                own = np.asarray(ca.DM(values).full())
+                assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
 
 
 def test_steps_behind_the_only_seed_have_no_slopes_and_no_tangents_of_them():

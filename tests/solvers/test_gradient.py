@@ -403,7 +403,7 @@ def test_where_nothing_is_to_be_done_the_controls_are_zero(final, variant):
 
 
 def test_slopes_whose_squares_are_no_numbers_are_not_remembered():
-    """Where nothing is learnt yet of a squared distance, the curvature along a first step is that of a run-away cost."""
+    """Where nothing is learnt yet of a squared distance, a first step sees the curvature of a run-away cost."""
     ocp = co.Problem(7.98583251431159)
     x, z = ocp.state("x", initial=0.0, final=1.0, variance=0.1), ocp.unknown("z", mean=0.0, variance=0.5)
     u = ocp.control("u")

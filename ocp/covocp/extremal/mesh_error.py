@@ -262,16 +262,16 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0, *, closely: bool =
     Returns:
         The largest of them; inf where a run along the controls diverges, nan where the segments do.
     """
-    error = _by_halves(extremal, gaps, closely=closely)
+    error = _by_halves(extremal, gaps, 0.0 if closely else CLOSELY)
     hidden = None if np.any(gaps) else unseen(extremal)
     return error if hidden is None else float(np.maximum(error, hidden.moved))
 
 
-def _by_halves(extremal: Extremal, gaps: Array | float, *, closely: bool = False) -> float:
-    """`node_error` by halves of the steps alone."""
+def _by_halves(extremal: Extremal, gaps: Array | float, looked: float = np.inf) -> float:
+    """`node_error` by halves of the steps alone; matrices along one run where segments are off by more than `looked`."""
     moved, size = by_segments(extremal, gaps)
     with np.errstate(over="ignore", invalid="ignore"):
-        matrices = closely or float((moved / size).max(initial=0.0)) > CLOSELY
+        matrices = float((moved / size).max(initial=0.0)) > looked
         left = None if np.any(gaps) else _departure(extremal, moved, size, matrices=matrices)
         if left is not None:
             nx = left.states.size

@@ -54,8 +54,7 @@ EXPORT int NAME(passage_tangent)(
     const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->ends, d = sizeof(double);
     if (seed && !d_after && !d_by_kicks && is_narrow(k, kicks, seed, d_kicks, d_seed)) {
         run(k, p->n, first, h1, h2, told, kicks);
-        const int done = narrow_second(k, p->n, seed, d_first, d_h1, d_h2, d_by_first, d_by_h1, d_by_h2);
-        if (done) return done < 0;
+        return narrow_second(k, p->n, seed, d_first, d_h1, d_h2, d_by_first, d_by_h1, d_by_h2);
     }
     if (!k->direction) {
         if (made(k, &k->direction, numbers(p))) return 1;

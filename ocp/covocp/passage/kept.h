@@ -13,6 +13,7 @@ typedef struct {
     double *direction, *shifted; /* the last direction; the tangents of the half-vectors along it; as `moved` */
     double *narrow; /* the last seed, and columns of all steps, see narrow.h; NULL until they are asked for */
     size_t narrowed; /* their numbers */
+    double *inverses; /* of the systems of those steps that are not triangular by their nonzeros; as `narrow` */
     int seeded;      /* steps of which the columns are known; 0: of none */
     size_t held; /* bytes of all of these */
 } Kept;

@@ -23,15 +23,61 @@ INLINE void add_few(
     }
 }
 
+/* B <- S^-1 B of a step, few columns; `spare`: as large. */
+INLINE void narrow_solve(const Kept *k, int n, const int r, int step, double *RESTRICT B, double *RESTRICT spare) {
+    const int m = 2 * n;
+    if (is_steady(&k->p, step)) {
+        solve_few(&k->p, n, r, factors_of(&k->p, step), B);
+        return;
+    }
+    const double *inverse = k->inverses + (size_t)step * m * m;
+    memcpy(spare, B, sizeof(double) * m * r);
+    for (int i = 0; i < m; ++i) {
+        const double *RESTRICT row = inverse + (size_t)i * m;
+        double sums[2] = {0.0}; /* as many columns as there mostly are, side by side */
+        for (int c = 0; c < r; c += 2) {
+            const int wide = r - c < 2 ? r - c : 2;
+            sums[0] = sums[1] = 0.0;
+            for (int j = 0; j < m; ++j)
+                for (int l = 0; l < wide; ++l) sums[l] += row[j] * spare[j * r + c + l];
+            for (int l = 0; l < wide; ++l) B[i * r + c + l] = sums[l];
+        }
+    }
+}
+
+/* `few_stages` by either. */
+INLINE void narrow_stages(
+    const Kept *k, int n, const int r, int step, const double *begin, double *RESTRICT y1, double *RESTRICT y2,
+    double *RESTRICT spare
+) {
+    const Passage *p = &k->p;
+    const double *h1 = p->h1 + (size_t)step * p->nnz, *h2 = p->h2 + (size_t)step * p->nnz;
+    moved_by(p, n, r, h2, begin, y1);
+    narrow_solve(k, n, r, step, y1, spare);
+    moved_by(p, n, r, h1, y1, y2);
+    for (int i = 0; i < 2 * n * r; ++i) y2[i] = y1[i] + 2.0 * GAP * ((y2[i] - begin[i]) / SHARE);
+}
+
+/* S^-1 of a step whose system is not triangular by its nonzeros; works in p->work up to 12 n^2. */
+static void invert(const Kept *k, int n, int step) {
+    const int m = 2 * n, w = 2 * m;
+    double *a = k->p.work, *unit = a + 8 * n * n, *inverse = k->inverses + (size_t)step * m * m;
+    memset(unit, 0, sizeof(double) * m * m);
+    for (int i = 0; i < m; ++i) unit[i * m + i] = 1.0;
+    solve_full(&k->p, n, step, NULL, w, unit, a);
+    for (int i = 0; i < m; ++i) memcpy(inverse + (size_t)i * m, a + (size_t)i * w + m, sizeof(double) * m);
+}
+
 /* Columns of all steps up to the seed, which follow from it and the point alone; M' (r x n) becomes that before all. */
-INLINE void narrow_columns(const Kept *k, int n, const int r, double *M, double *column) {
+INLINE void narrow_columns(const Kept *k, int n, const int r, double *M, double *spare) {
     const Passage *p = &k->p;
     const size_t half = (size_t)n * (n + 1) / 2, square = (size_t)n * n, tall = (size_t)2 * n * r;
     for (int at = k->seeded - 1; at >= 0; --at) {
         double *z = narrow_of(k, r, at);
+        if (!is_steady(p, at)) invert(k, n, at);
         divide_few(p->factor + at * square, p->swaps + (size_t)at * n, n, r, M);
-        stacked(n, r, at ? p->after + (at - 1) * half : k->first, M, z, column);
-        few_stages(p, n, r, at, z, z + tall, z + 2 * tall);
+        stacked(n, r, at ? p->after + (at - 1) * half : k->first, M, z, spare);
+        narrow_stages(k, n, r, at, z, z + tall, z + 2 * tall, spare);
     }
 }
 
@@ -57,7 +103,7 @@ INLINE void narrow_step(
     memset(inner, 0, sizeof(double) * tall);
     add_few(p, r, 1.0, e1, y1, inner);
     add_few(p, r, -1.0 / 12.0, h2, inner, dy1);
-    solve_few(p, n, r, factors_of(p, at), dy1);
+    narrow_solve(k, n, r, at, dy1, dv);
     moved_by(p, n, r, h1, dy1, dv);
     add_few(p, r, -GAP, e1, y1, dv);
     for (size_t i = 0; i < tall; ++i) dv[i] = (dv[i] - dz[i]) / SHARE, dy2[i] = dy1[i] + 2.0 * GAP * dv[i];
@@ -82,7 +128,7 @@ INLINE void narrow_back(
         for (int i = 0; i < n; ++i) dM[c * n + i] -= dx[i * r + c]; /* X dM = dM+ - dX M */
     divide_few(p->factor + at * square, p->swaps + (size_t)at * n, n, r, dM);
     stacked(n, r, at ? p->after + (at - 1) * half : k->first, dM, begin, weighted);
-    few_stages(p, n, r, at, begin, w, w + tall);
+    narrow_stages(k, n, r, at, begin, w, w + tall, weighted);
     for (int stage = 0; stage < 2; ++stage, w += tall) {
         const double *y = z + (1 + stage) * tall;
         double *dy = z + (3 + stage) * tall, *out = stage ? out2 : out1;
@@ -119,11 +165,12 @@ INLINE void narrow_tangents(
         for (int i = 0; i < n; ++i) s->M[c * n + i] = z[i * r + c];
 }
 
-/* Whether `narrow_second` takes these slopes: those of few columns. */
+/* Whether `narrow_second` takes these slopes: those of few columns, where something is kept of all steps. */
 static int is_narrow(const Kept *k, const double *kicks, const double *seed, const double *d_kicks, const double *d_seed) {
     const Passage *p = &k->p;
     const int half = p->n * (p->n + 1) / 2;
-    if (!p->brief || p->reads || kicks || d_kicks || !is_few(p, p->n, seed)) return 0;
+    const int all_kept = p->brief || (p->full && !p->order);
+    if (!all_kept || p->reads || kicks || d_kicks || !is_few(p, p->n, seed)) return 0;
     for (int e = 0; d_seed && e < p->ends; ++e)
         if (is_asked(d_seed + (size_t)e * half, half)) return 0;
     return 1;
@@ -148,7 +195,7 @@ static int narrow_room(Kept *k, size_t count) {
     return 0;
 }
 
-/* Tangents of the slopes at the point of the last run: 1; 0 where some step is taken as a full matrix, -1 without memory. */
+/* Tangents of the slopes at the point of the last run; nonzero without memory. */
 static int narrow_second(
     Kept *k, int n, const double *seed, const double *d_first, const double *d1, const double *d2, double *by_first,
     double *by_h1, double *by_h2
@@ -156,17 +203,18 @@ static int narrow_second(
     const Passage *p = &k->p;
     const size_t half = (size_t)n * (n + 1) / 2, square = (size_t)n * n, nnz = p->nnz;
     const int steps = seeded_steps(p, seed), behind = p->count - steps;
-    double *work = p->work, *spare = work + 6 * square;
+    double *spare = p->work, *work = p->work + 12 * square;
     Moved v = {{0, 0, work, work + square, work + 2 * square}, NULL, work + 3 * square};
-    for (int at = 0; at < steps; ++at)
-        if (!p->good[at]) return 0;
+    int all = 1;
+    for (int at = 0; at < steps; ++at) all &= is_steady(p, at);
+    if (!all && made(k, &k->inverses, (size_t)p->moves * 4 * square)) return 1;
     if (by_h1) memset(by_h1 + steps * nnz, 0, sizeof(double) * behind * nnz);
     if (by_h2) memset(by_h2 + steps * nnz, 0, sizeof(double) * behind * nnz);
     if (steps) {
         const double *own = seed + (steps / p->every - 1) * half;
         join(&v.s, n, p->chosen, own);
         const int r = v.s.few;
-        if (narrow_room(k, half + (size_t)p->moves * 11 * n * r)) return -1;
+        if (narrow_room(k, half + (size_t)p->moves * 11 * n * r)) return 1;
         const int fresh = k->seeded != steps || memcmp(k->narrow, own, sizeof(double) * half);
         memcpy(k->narrow, own, sizeof(double) * half);
         k->seeded = steps;
@@ -178,5 +226,5 @@ static int narrow_second(
             narrow_tangents(k, n, r, fresh, &v.s, d_first, d1, d2, v.dM, spare, by_h1, by_h2);
     }
     if (by_first) pack_tangents(&v, n, spare, by_first);
-    return 1;
+    return 0;
 }

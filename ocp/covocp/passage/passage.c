@@ -34,7 +34,7 @@ EXPORT int passage_newer(void) {
 
 EXPORT void passage_free(Kept *k) {
     if (!k) return;
-    void *owned[] = {k->whole, k->reals, k->stages, k->moved, k->turned, k->direction, k->shifted, k->narrow};
+    void *owned[] = {k->whole, k->reals, k->stages, k->moved, k->turned, k->direction, k->shifted, k->narrow, k->inverses};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(k);
 }
