@@ -268,7 +268,7 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0, *, closely: bool =
 
 
 def _by_halves(extremal: Extremal, gaps: Array | float, looked: float = np.inf) -> float:
-    """`node_error` by halves of the steps alone; matrices along one run where segments are off by more than `looked`."""
+    """`node_error` by halves alone; matrices along one run where segments are off by more than `looked`."""
     moved, size = by_segments(extremal, gaps)
     with np.errstate(over="ignore", invalid="ignore"):
         matrices = float((moved / size).max(initial=0.0)) > looked
