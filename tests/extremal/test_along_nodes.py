@@ -16,13 +16,14 @@ import covocp as co
 from covocp.extremal import costates, lagrangian
 from covocp.extremal.active_constraints import held_by
 from covocp.extremal.adjoint_steps import explicit_pairs
-from covocp.extremal.along_nodes import along_nodes
+from covocp.extremal.along_nodes import _along_nodes, along_nodes
 from covocp.extremal.costates import discrete_costates, integrated_costates
 from covocp.extremal.costates_in_numbers import has_forms
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.models import bryson_denham, mass_chain, unknown_lag
 from covocp.passage import library
+from covocp.passage.columns import derivative_in_columns
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
@@ -147,3 +148,23 @@ def test_integrated_costates_are_those_of_the_slopes_of_h(monkeypatch: pytest.Mo
         errors = [np.abs(getattr(one, place)[first:] - exact).max(initial=0.0) / size for one in own]
         assert errors[2] <= 1e-5
         assert all(fine <= max(before / 10.0, 1e-9) for before, fine in pairwise(errors))
+
+
+@pytest.mark.parametrize("missing", [("forward",), ("reverse",), ("reverse", "forward")])
+def test_what_the_library_has_no_derivatives_of_is_casadis(
+    monkeypatch: pytest.MonkeyPatch, missing: tuple[str, ...]
+) -> None:
+    """Derivatives of too many operations are not made."""
+    solution = co.solve(mass_chain.problem(masses=1), intervals=60, progress=False)
+    known = solution.optimality
+    made = derivative_in_columns
+
+    def some(owner: Any, function: ca.Function, *kinds: str) -> Any:
+        return None if kinds == missing else made(owner, function, *kinds)
+
+    monkeypatch.setattr("covocp.extremal.along_nodes.derivative_in_columns", some)
+    _along_nodes.cache_clear()
+    discrete_costates.cache_clear()
+    again = co.solve(mass_chain.problem(masses=1), intervals=60, progress=False).optimality
+    assert again.curvature == pytest.approx(known.curvature, rel=1e-6)
+    assert again.costate_difference == pytest.approx(known.costate_difference, rel=1e-6)

@@ -68,6 +68,13 @@ class AlongNodes:
 
     __repr__ = short_repr
 
+    @property
+    def twice(self) -> bool:
+        """Whether the library has second derivatives of all steps."""
+        st = self.statement
+        entries = all(_have(st, way.function, ("forward",), ("reverse", "forward")) for way in self.ways)
+        return entries and _have(st, nominal_interval(st, 1, self.mesh.step), ("reverse", "forward"))
+
     def at(self, j: int) -> list[Array]:
         """States before substep j of all intervals, and what `Interval` has of it."""
         before, _, *columns = (np.asfortranarray(values[:, j :: self.mesh.substeps]) for values in self.steps)
@@ -137,7 +144,7 @@ def _along_nodes(
         return None
     columns, advance = columns_of_parts(mesh, m, t.u.T, t.duration, parameters), nominal_interval(st, 1, mesh.step)
     found = numbers_in_turn(st, advance, t.x[:n].T, columns, m)
-    if found is None or derivative_in_columns(st, advance, "reverse") is None:
+    if found is None or not _have(st, advance, ("reverse",), ("forward",)):
         return None
     before = np.empty((n, m, st.nx))
     before[:, 0], before[:, 1:] = t.x[:n], found[0].T.reshape(n, m, -1)[:, :-1]
@@ -158,10 +165,15 @@ def _way(statement: Statement, mesh: Mesh, position: int, first: Array, steps: l
     """A matrix from its half-vector among all where it starts; None where the library cannot take its entries."""
     (function, pattern), block = gauss_entries(statement, position, mesh.step), statement.matrices[position]
     points = numbers_in_columns(statement, function, steps)
-    if points is None or derivative_in_columns(statement, function, "reverse") is None:
+    if points is None or not _have(statement, function, ("reverse",)):
         return None
     course = Course(first[block.span], points, block.size, pattern, mesh.substeps)
     return Way(block.span, function, course)
+
+
+def _have(statement: Statement, function: ca.Function, *all_kinds: tuple[str, ...]) -> bool:
+    """Whether the library has derivatives of these kinds of a function."""
+    return all(derivative_in_columns(statement, function, *kinds) is not None for kinds in all_kinds)
 
 
 def derived(statement: Statement, function: ca.Function, *kinds: str) -> OnColumns:

@@ -237,7 +237,7 @@ def _hessian(extremal: Extremal, costates: Costates, held: Entries) -> Hessian |
     if seen or st.tied is not None:
         return None
     weights, along = m.matrices.copy(), along_nodes(st, extremal.mesh, extremal.trajectory, extremal.parameters)
-    if along is None:
+    if along is None or not along.twice:
         return None
     if st.ne:
         if _terminal(st).bent:
