@@ -203,6 +203,8 @@ class Seeds:
     kicks: Array
     entries: list[tuple[Array, list[Array]]]
 
+    __repr__ = short_repr
+
     @staticmethod
     def of(along: AlongNodes, weights: Array) -> Seeds:
         """Of weights of the half-vectors at the nodes, (N + 1, ne)."""
@@ -239,6 +241,8 @@ class Backward:
     end: Array
     duration: float
     seeds: list[Array]
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(along: AlongNodes, given: Seeds, costates: Array | None = None) -> Backward:
