@@ -11,12 +11,14 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from unittest import mock
 
 import casadi as ca
 import numpy as np
 
 import covocp as co
+from covocp.extremal import costates, lagrangian
 from covocp.models import mars_entry, mass_chain, unknown_lag
 from covocp.passage import library
 from covocp.passage.sweep import passed_by
@@ -76,8 +78,26 @@ def solves(problem: Callable[[], co.Problem], rounds: int, **options: int) -> li
     return [number for pair in zip(*result, strict=True) for number in pair]
 
 
+def conditions(problem: Callable[[], co.Problem], rounds: int, **options: int) -> list[float]:
+    """Seconds of a first solve, and of its `optimality` by numbers and by CasADi's expressions."""
+    times = []
+    for _ in range(rounds):
+        first = median_of(lambda: co.solve(problem(), progress=False, **options), 1)
+        found = [first]
+        for by_numbers in (True, False):
+            solution = co.solve(problem(), progress=False, **options)
+            with ExitStack() as patches:
+                for module in () if by_numbers else (costates, lagrangian):
+                    patches.enter_context(mock.patch.object(module, "along_nodes", return_value=None))
+                if not by_numbers:
+                    patches.enter_context(mock.patch.object(costates, "has_forms", return_value=False))
+                found.append(median_of(lambda own=solution: own.optimality, 1))
+        times.append(found)
+    return [statistics.median(column) for column in zip(*times, strict=True)]
+
+
 def main(rounds: int = 5) -> None:
-    """Print both tables."""
+    """Print all tables."""
     print(co.build_info())
     print("\nmilliseconds of an evaluation, chain of masses, 50 intervals (compiled, CasADi)")
     print("rows     f                 f and its gradient   gradient over f, compiled")
@@ -95,6 +115,10 @@ def main(rounds: int = 5) -> None:
         t = [1e3 * value for value in solves(problem, rounds, **options)]
         rates = f"{1e3 / t[4]:8.0f} {1e3 / t[5]:8.0f}"
         print(f"{name:16s} {t[0]:8.1f} {t[1]:8.1f}   {t[2]:8.1f} {t[3]:8.1f}   {t[4]:8.1f} {t[5]:8.1f}   {rates}")
+    print("\nmilliseconds of optimality (by numbers, by CasADi's expressions), and its share of a first solve")
+    for name, problem, options in cases:
+        first, own, plain = (1e3 * value for value in conditions(problem, rounds, **options))
+        print(f"{name:16s} {own:8.1f} {plain:8.1f}   {own / first:8.2f}")
 
 
 if __name__ == "__main__":

@@ -341,7 +341,9 @@ def test_transversality_away_from_all_bounds_is_told_whatever_constants_cost(con
     costs = [co.solve(problem(T + s), intervals=40, tolerance=1e-9, progress=False).cost for s in (-step, step)]
     slope = (costs[1] - costs[0]) / (2 * step)
     assert abs(slope) > 1e-6
-    assert loose.optimality.transversality > 1e-7
+    assert (
+        0.1 * abs(slope) < loose.optimality.transversality < abs(slope)
+    )  # in terms of H, which are some units of cost
 
 
 def test_transversality_is_zero_where_a_bound_holds_the_duration():

@@ -18,7 +18,14 @@ from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
-from covocp.passage.columns import FEWEST, OnColumns, derivative_in_columns, numbers_in_columns, numbers_in_turn
+from covocp.passage.columns import (
+    FEWEST,
+    OnColumns,
+    Prepared,
+    derivative_in_columns,
+    numbers_in_columns,
+    numbers_in_turn,
+)
 from covocp.passage.library import functions
 from covocp.passage.sweep import Course
 from covocp.statement.statement import Statement
@@ -55,14 +62,13 @@ class AlongNodes:
     """All intervals run from their nodes, and the matrices along them.
 
     Attributes:
-        statement, mesh, parameters: what is run.
+        statement, mesh: what is run.
         steps: states at both ends of each substep and what `Interval` has, a column each.
         ways: the matrices.
     """
 
     statement: Statement
     mesh: Mesh
-    parameters: Array
     steps: list[Array]
     ways: tuple[Way, ...]
 
@@ -152,13 +158,7 @@ def _along_nodes(
     ways = [_way(st, mesh, i, t.e[0], steps) for i in st.ahead]
     if any(way is None for way in ways):
         return None
-    return AlongNodes(
-        statement=st,
-        mesh=mesh,
-        parameters=parameters,
-        steps=steps,
-        ways=tuple(way for way in ways if way is not None),
-    )
+    return AlongNodes(statement=st, mesh=mesh, steps=steps, ways=tuple(way for way in ways if way is not None))
 
 
 def _way(statement: Statement, mesh: Mesh, position: int, first: Array, steps: list[Array]) -> Way | None:
@@ -297,7 +297,7 @@ class Ahead:
         for j in range(mesh.substeps):
             controls = [np.zeros((st.nu, n), order="F") for _ in range(2)]
             given = [*along.at(j), *([None] * 3), moved, *controls, *([None] * LATER)]
-            self._runs.append(forward.prepared(given, n))
+            self._runs.append(Prepared(forward, given, n))
             self.steps.append((moved, controls[0], controls[1], self._runs[-1].found[0]))
             moved = self._runs[-1].found[0]
 
@@ -334,7 +334,7 @@ class Hessian:
         for j, (moved, begin, end, _) in enumerate(self._ahead.steps):
             seed = np.zeros((st.nx, n), order="F")
             adjoint = [*along.at(j), *unread, seeds[j], None, cost, *([None] * (3 + LATER))]
-            behind = back.prepared([*adjoint, moved, begin, end, *still, *unread, seed, None, None], n)
+            behind = Prepared(back, [*adjoint, moved, begin, end, *still, *unread, seed, None, None], n)
             self._nominal.append((seed, behind))
         self._ways = [_Moved(along, way, self._moved, *own) for way, own in zip(along.ways, given.entries, strict=True)]
 
@@ -372,12 +372,11 @@ class _Moved:
         st, count = along.statement, along.steps[0].shape[1]
         still, unread = [None] * LATER, [None] * 2
         self._course, self._seeds = way.course, seeds
-        self._ahead = derived(st, way.function, "forward").prepared([*along.steps, *unread, *moved, *still], count)
+        ahead, back = derived(st, way.function, "forward"), derived(st, way.function, "reverse", "forward")
+        self._ahead = Prepared(ahead, [*along.steps, *unread, *moved, *still], count)
         self._slopes = [np.zeros_like(values, order="F") for values in points]
         adjoint = [*along.steps, *unread, *points, *([None] * (4 + LATER))]
-        self._back = derived(st, way.function, "reverse", "forward").prepared(
-            [*adjoint, *moved, *still, *unread, *self._slopes], count
-        )
+        self._back = Prepared(back, [*adjoint, *moved, *still, *unread, *self._slopes], count)
         self._entries = [np.zeros_like(values, order="F") for values in points]
 
     def add(self, total: Sequence[Array]) -> None:

@@ -379,9 +379,7 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
     bound = st.duration.lower if residual > 0 else st.duration.upper
     distance = abs(trajectory.duration - bound)
     near = distance <= ACTIVE * bound < np.inf
-    if (
-        not near and distance <= BESIDE * bound < np.inf
-    ):  # as close as the cost sees: solvers stay off a bound by what it costs
+    if not near and distance <= BESIDE * bound < np.inf:  # solvers stay off a bound by what the cost hardly sees
         cost = variable_cost(extremal) + (0.0 if within is None else within.variable)
         near = distance * abs(residual) <= ACTIVE * cost
     if near:

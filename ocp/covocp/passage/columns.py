@@ -267,15 +267,6 @@ class OnColumns:
             raise MemoryError
         return found
 
-    def prepared(self, given: Sequence[Array | None], count: int) -> Prepared:
-        """Its evaluation on dense arguments that stay where they are, so many columns (rows, count) in Fortran's order.
-
-        Args:
-            given: of each argument; None: zeros.
-            count: columns.
-        """
-        return Prepared(self, given, count)
-
     def run(self, addresses: Sequence[int | None], count: int, steps: int = 1) -> int:
         """Evaluate it on so many columns, or sequences of them.
 
@@ -298,7 +289,13 @@ class Prepared:
     """
 
     def __init__(self, told: OnColumns, given: Sequence[Array | None], count: int) -> None:
-        """Make room for the results."""
+        """Make room for the results.
+
+        Args:
+            told: the function.
+            given: of each argument its columns (rows, count), dense and in Fortran's order, kept here; None: zeros.
+            count: columns.
+        """
         shapes = [(shape.shape[0] if shape.nnz() else 0, shape.shape[1] * count) for shape in told.outputs]
         self.found = [np.zeros(shape, order="F") for shape in shapes]
         self._told, self._given, self._count = told, given, count

@@ -186,6 +186,9 @@ class Course:
             seeds: as of `slopes`, in Fortran's order.
             moved: tangents of the entries at both points, in Fortran's order.
             slopes: where tangents of the slopes are written, likewise.
+
+        Raises:
+            MemoryError: there was none.
         """
         along = (self._still.ctypes.data, *(array.ctypes.data for array in moved))
         places = (None, *(array.ctypes.data for array in slopes), None, None)

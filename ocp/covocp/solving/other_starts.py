@@ -148,20 +148,23 @@ class OtherStarts(ClassicalRuns):
             return failed
         kept = self._options, self._prepared
         before = self._values, self._asked, self._looked, self._first
+        again: Found | None = None
         try:
             self._values, self._looked, self._ran = values, False, False
             self._asked = with_instants(self.statement, graded(*self._ungraded, values), values)
             options = self._laid_out()
             self._keep(options, self._ready(options))
             self._first = self._options, self._prepared
-            again: Found | None = run(reporter=reporter)
-        except (CovocpError, RuntimeError):  # the model has no values there; CasADi's
-            again = None
-        if again is not None and again[0].converged:
-            return with_stats(again[0], **counted(failed[0], again[0])), again[1]
-        self._values, self._asked, self._looked, self._first = before
-        self._keep(*kept)
-        return failed
+            again = run(reporter=reporter)
+        except SolveError:  # there is no solution
+            raise
+        except (CovocpError, RuntimeError):  # the model has no values there; CasADi's: what failed first is told
+            return failed
+        finally:
+            if again is None or not again[0].converged:
+                self._values, self._asked, self._looked, self._first = before
+                self._keep(*kept)
+        return (with_stats(again[0], **counted(failed[0], again[0])), again[1]) if again[0].converged else failed
 
     def _others(
         self, values: Array, gain_start: GainStart, guess: Later | Solution, reporter: Progress, *, assess: bool
