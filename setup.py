@@ -10,7 +10,7 @@ from setuptools.command.build_ext import build_ext
 
 # Nothing that changes how the process computes: linking with
 # -ffast-math would flush subnormal numbers everywhere.
-FLAGS = ["-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
+FLAGS = ["-g0", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
 
 class BuildPassage(build_ext):

@@ -43,14 +43,19 @@ INLINE void divide_few(const double *RESTRICT factor, const double *RESTRICT swa
 }
 
 /* -1/2 (J left) right' at the nonzeros, both (2n x r). */
-INLINE void at_nonzeros(
-    const Passage *p, int n, int r, const double *RESTRICT left, const double *RESTRICT right, double *RESTRICT slopes
+INLINE void nonzeros_by(
+    const int r, const Passage *p, int n, const double *RESTRICT left, const double *RESTRICT right,
+    double *RESTRICT slopes
 ) {
     for (int q = 0; q < p->nnz; ++q) {
         const int i = p->row[q];
         const double *RESTRICT one = left + (i < n ? i + n : i - n) * r, *RESTRICT other = right + p->col[q] * r;
         slopes[q] = (i < n ? -0.5 : 0.5) * dot(one, other, r);
     }
+}
+
+static void at_nonzeros(const Passage *p, int n, int r, const double *left, const double *right, double *slopes) {
+    BY_WIDTH(nonzeros_by, r, p, n, left, right, slopes);
 }
 
 /* P += the slopes of one step's result. */
@@ -137,8 +142,8 @@ static void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRI
 }
 
 /* Slopes by H at one point, from its stage times M, (2n x r); weighted: as large. */
-INLINE void slopes_few(
-    const Passage *p, int n, const int r, const double *C, const double *y, double *RESTRICT weighted, double *out
+INLINE void slopes_by(
+    const int r, const Passage *p, int n, const double *C, const double *y, double *RESTRICT weighted, double *out
 ) {
     for (int i = 0; i < 2 * n; ++i)
         for (int c = 0; c < r; ++c) {
@@ -146,7 +151,11 @@ INLINE void slopes_few(
             for (int q = 0; q < r; ++q) sum += y[i * r + q] * C[q * r + c];
             weighted[i * r + c] = sum;
         }
-    at_nonzeros(p, n, r, y, weighted, out);
+    nonzeros_by(r, p, n, y, weighted, out);
+}
+
+static void slopes_few(const Passage *p, int n, int r, const double *C, const double *y, double *weighted, double *out) {
+    BY_WIDTH(slopes_by, r, p, n, C, y, weighted, out);
 }
 
 /* Slopes before step k and by its H: few columns; `before`: half-vector there. */

@@ -23,7 +23,7 @@ INLINE void less_rows(const double *entries, const int *rows, int count, const i
 }
 
 /* S^-1 B in place, few columns. */
-INLINE void solve_few(const Passage *p, int n, const int r, const double *factors, double *B) {
+INLINE void solve_by(const int r, const Passage *p, int n, const double *factors, double *B) {
     const int m = 2 * n, filled = p->right[m];
     const double *lower = factors, *upper = lower + filled, *inverses = upper + filled;
     for (int i = 0; i < m; ++i) {
@@ -38,6 +38,10 @@ INLINE void solve_few(const Passage *p, int n, const int r, const double *factor
     }
 }
 
+static void solve_few(const Passage *p, int n, int r, const double *factors, double *B) {
+    BY_WIDTH(solve_by, r, p, n, factors, B);
+}
+
 /* E a of a half-vector. */
 INLINE void by_half(const double *RESTRICT half, int n, const double *RESTRICT a, double *RESTRICT product) {
     memset(product, 0, sizeof(double) * n);
@@ -50,7 +54,7 @@ INLINE void by_half(const double *RESTRICT half, int n, const double *RESTRICT a
 }
 
 /* B (2n x r) <- (I - g H) A. */
-INLINE void moved_by(const Passage *p, int n, const int r, const double *h, const double *RESTRICT A, double *RESTRICT B) {
+INLINE void moves_by(const int r, const Passage *p, int n, const double *h, const double *RESTRICT A, double *RESTRICT B) {
     memcpy(B, A, sizeof(double) * 2 * n * r);
     for (int q = 0; q < p->nnz; ++q) {
         const double share = GAP * h[q];
@@ -58,8 +62,12 @@ INLINE void moved_by(const Passage *p, int n, const int r, const double *h, cons
     }
 }
 
+static void moved_by(const Passage *p, int n, int r, const double *h, const double *A, double *B) {
+    BY_WIDTH(moves_by, r, p, n, h, A, B);
+}
+
 /* [M; E M] (2n x r) from M' (r x n) and the half-vector of E; column: n. */
-INLINE void stacked(int n, const int r, const double *half, const double *M, double *RESTRICT both, double *column) {
+static void stacked(int n, const int r, const double *half, const double *M, double *RESTRICT both, double *column) {
     for (int c = 0; c < r; ++c) {
         by_half(half, n, M + c * n, column);
         for (int i = 0; i < n; ++i) both[i * r + c] = M[c * n + i], both[(n + i) * r + c] = column[i];
@@ -67,7 +75,7 @@ INLINE void stacked(int n, const int r, const double *half, const double *M, dou
 }
 
 /* Y1 M and Y2 M (2n x r) of step k from [M; E M] before it. */
-INLINE void few_stages(
+static void few_stages(
     const Passage *p, int n, const int r, int k, const double *begin, double *RESTRICT y1, double *RESTRICT y2
 ) {
     const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;

@@ -45,6 +45,18 @@
 #define RESTRICT
 #endif
 
+/* A function of r columns, its first argument, written out for one and for two of them, as there mostly are: once for
+ * all that call it, in whose place it would be written out again and again. */
+#define BY_WIDTH(function, r, ...) \
+    do { \
+        if ((r) == 1) \
+            function(1, __VA_ARGS__); \
+        else if ((r) == 2) \
+            function(2, __VA_ARGS__); \
+        else \
+            function(r, __VA_ARGS__); \
+    } while (0)
+
 static const double GAP = 0.28867513459481287;
 static const double SHARE = 0.5 - 2.0 * 0.28867513459481287;
 /* Of information times variance in a step, above which the transition is made. */

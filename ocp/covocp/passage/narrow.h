@@ -14,8 +14,8 @@ static double *narrow_of(const Kept *k, int r, int step) {
 }
 
 /* sum += share H A, of few columns. */
-INLINE void add_few(
-    const Passage *p, const int r, double share, const double *h, const double *RESTRICT A, double *RESTRICT sum
+INLINE void adds_by(
+    const int r, const Passage *p, double share, const double *h, const double *RESTRICT A, double *RESTRICT sum
 ) {
     for (int q = 0; q < p->nnz; ++q) {
         const double weight = share * h[q];
@@ -23,8 +23,12 @@ INLINE void add_few(
     }
 }
 
+static void add_few(const Passage *p, int r, double share, const double *h, const double *A, double *sum) {
+    BY_WIDTH(adds_by, r, p, share, h, A, sum);
+}
+
 /* B <- S^-1 B of a step, few columns; `spare`: as large. */
-INLINE void narrow_solve(const Kept *k, int n, const int r, int step, double *RESTRICT B, double *RESTRICT spare) {
+static void narrow_solve(const Kept *k, int n, const int r, int step, double *RESTRICT B, double *RESTRICT spare) {
     const int m = 2 * n;
     if (is_steady(&k->p, step)) {
         solve_few(&k->p, n, r, factors_of(&k->p, step), B);
@@ -46,7 +50,7 @@ INLINE void narrow_solve(const Kept *k, int n, const int r, int step, double *RE
 }
 
 /* `few_stages` by either. */
-INLINE void narrow_stages(
+static void narrow_stages(
     const Kept *k, int n, const int r, int step, const double *begin, double *RESTRICT y1, double *RESTRICT y2,
     double *RESTRICT spare
 ) {

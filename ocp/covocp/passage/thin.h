@@ -15,7 +15,7 @@
 static const double ROUNDING = 1e-12;
 
 /* S'^-1 B in place, few columns. */
-INLINE void solve_few_turned(const Passage *p, int n, const int r, const double *factors, double *RESTRICT B) {
+INLINE void solve_turned_by(const int r, const Passage *p, int n, const double *factors, double *RESTRICT B) {
     const int m = 2 * n, filled = p->right[m];
     const double *lower = factors, *upper = lower + filled, *inverses = upper + filled;
     for (int i = 0; i < m; ++i) {
@@ -31,9 +31,13 @@ INLINE void solve_few_turned(const Passage *p, int n, const int r, const double 
     }
 }
 
+static void solve_few_turned(const Passage *p, int n, int r, const double *factors, double *B) {
+    BY_WIDTH(solve_turned_by, r, p, n, factors, B);
+}
+
 /* B (2n x r) <- (I - g H)' A. */
-INLINE void moved_by_turned(
-    const Passage *p, int n, const int r, const double *h, const double *RESTRICT A, double *RESTRICT B
+INLINE void moves_turned_by(
+    const int r, const Passage *p, int n, const double *h, const double *RESTRICT A, double *RESTRICT B
 ) {
     memcpy(B, A, sizeof(double) * 2 * n * r);
     for (int q = 0; q < p->nnz; ++q) {
@@ -42,8 +46,12 @@ INLINE void moved_by_turned(
     }
 }
 
+static void moved_by_turned(const Passage *p, int n, int r, const double *h, const double *A, double *B) {
+    BY_WIDTH(moves_turned_by, r, p, n, h, A, B);
+}
+
 /* v += D^-1 w of step k, both (2n x r); spare: 6 n r. */
-INLINE void add_passed_back(
+static void add_passed_back(
     const Passage *p, int n, const int r, int k, const double *RESTRICT w, double *spare, double *RESTRICT v
 ) {
     const int half = n * r;
