@@ -18,9 +18,9 @@ from covocp.extremal.active_constraints import held_by
 from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.along_nodes import _along_nodes, along_nodes
 from covocp.extremal.costates import discrete_costates, integrated_costates
-from covocp.extremal.costates_in_numbers import has_forms
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
+from covocp.extremal.forms import has_forms
 from covocp.models import bryson_denham, mass_chain, unknown_lag
 from covocp.passage import library
 from covocp.passage.columns import derivative_in_columns

@@ -12,7 +12,8 @@ from scipy.linalg import eigh, null_space
 
 import covocp as co
 from covocp.extremal import curvature
-from covocp.extremal.curvature import mass_matrix, smallest_curvature
+from covocp.extremal.curvature import smallest_curvature
+from covocp.extremal.metric import mass_matrix
 from covocp.transcription.trajectory import Multipliers
 
 
@@ -201,6 +202,7 @@ def test_a_curvature_that_would_take_too_long_is_not_known(monkeypatch):
     extremal = at_rest(quadratic(1.0, 0.9, 1.0), 30)
     products = []
     monkeypatch.setattr(curvature, "_seconds", lambda *_: products.append(1) or 1.0)
+    monkeypatch.setattr(curvature, "FEW_NUMBERS", 0)
     assert smallest_curvature(extremal, 5.0).verdict == "unknown"
     known = smallest_curvature(extremal, 1e6)
     assert known.value == smallest_curvature(extremal).value
@@ -211,6 +213,7 @@ def test_a_curvature_that_would_take_too_long_is_not_known(monkeypatch):
 
 def test_what_is_not_known_of_a_solution_is_said(monkeypatch):
     monkeypatch.setattr(curvature, "_seconds", lambda *_: 1e9)
+    monkeypatch.setattr(curvature, "FEW_NUMBERS", 0)
     solution = solve(quadratic(0.0, 0.5, 1.0), intervals=10)
     assert np.isnan(solution.optimality.curvature)
     assert "NOT KNOWN: it would take longer" in " ".join(str(solution).split())
@@ -251,6 +254,7 @@ def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch
     assert np.trapezoid(v**2, fine) - 2.5 * a**2 - b**2 + 30 * c**2 < 0  # so it is a saddle
     products = counted_products(monkeypatch)
     monkeypatch.setattr(curvature, "_seconds", lambda *_: 1.0)
+    monkeypatch.setattr(curvature, "FEW_NUMBERS", 0)
     for most in (9.01, 10.0, 12.0, 20.0, 40.0, 80.0):
         products.clear()
         assert smallest_curvature(extremal, most).verdict in ("unknown", "saddle")

@@ -12,7 +12,8 @@ from scipy.linalg import eigh, null_space
 
 import covocp as co
 from covocp.extremal.costates import discrete_costates
-from covocp.extremal.curvature import held_jacobian, mass_matrix, smallest_curvature
+from covocp.extremal.curvature import held_jacobian, smallest_curvature
+from covocp.extremal.metric import mass_matrix
 from covocp.extremal.optimality import complementarity
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.transcribing import transcribe

@@ -13,7 +13,8 @@ from problems import graded, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
-from covocp.extremal.curvature import mass_matrix, smallest_curvature
+from covocp.extremal.curvature import smallest_curvature
+from covocp.extremal.metric import mass_matrix
 from covocp.models import unknown_lag
 from covocp.solving.beside_classical import is_roundoff
 from covocp.transcription.mesh import Options

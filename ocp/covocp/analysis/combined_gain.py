@@ -26,9 +26,10 @@ from covocp.base.matrices import Array, distinct
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.costates import discrete_costates
-from covocp.extremal.curvature import held_jacobian, mass_matrix
+from covocp.extremal.curvature import held_jacobian
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls
+from covocp.extremal.metric import mass_matrix
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.beside_classical import is_roundoff

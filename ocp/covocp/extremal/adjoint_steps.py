@@ -6,8 +6,8 @@ import numpy as np
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, own_units, stacked, unpack
-from covocp.extremal.costates_in_numbers import drift_matrices
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.forms import drift_matrices
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.stiffness import state_jacobian
 

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
-from covocp.base.matrices import Array, stacked
+from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined, with_parts
-from covocp.extremal.hamiltonian import Costates, by_controls, terms_of
+from covocp.extremal.hamiltonian import Costates, by_controls_at, terms_of
+from covocp.extremal.hamiltonian_in_numbers import ByControls
 from covocp.extremal.inside import controlled_nodes
 from covocp.statement.interval import repeated
 
@@ -105,10 +105,10 @@ def estimate_control_error(
         extremal, kinds = refined(extremal), (np.repeat(kinds[0], points, axis=0), np.repeat(kinds[1], points, axis=0))
         around = np.repeat(around, points, axis=1)
     along = _Along.of(extremal, 2)
-    places = [along.at(j) for j in range(3)]
+    places = along.everywhere()
     convex = _convex(places, _magnitudes(extremal))
     if extremal.mesh.step == "rodas":
-        total = _by_middles(extremal, along, convex, kinds, places[1][1])
+        total = _by_middles(extremal, along, convex, kinds, places[1].curvature)
     else:
         total = _by_points(extremal, along, convex, kinds, places)
         left = (kinds[0] | kinds[1]) & ~convex
@@ -125,36 +125,38 @@ class _Along:
         fine: the extremal with these places as nodes.
         parts: of each interval.
         ends: controls at both ends of each interval (2, N, nu).
-        function: (x, u, e, t, T, p, costates) of all intervals -> H_u, H_uu, terms of H_u.
     """
 
     fine: Extremal
     parts: int
     ends: tuple[Array, Array]
-    function: Matrices
 
     __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal, parts: int) -> _Along:
         """Of an extremal whose limits are imposed at its nodes."""
-        u, n = extremal.controls, extremal.mesh.intervals
+        u = extremal.controls
         return _Along(
             fine=with_parts(extremal, parts),
             parts=parts,
             ends=(u[:-1], u[:-1] if extremal.mesh.control == "constant" else u[1:]),
-            function=Matrices(by_controls(extremal.statement).map(n)),
         )
 
     def control(self, j: int) -> Array:
         """The control there, (N, nu)."""
         return self.ends[0] + j / self.parts * (self.ends[1] - self.ends[0])
 
-    def at(self, j: int) -> list[Array]:
-        """H_u (N, nu, 1), H_uu (N, nu, nu) and terms of H_u at place j."""
-        columns, costates = self._points(j, self.control(j))
-        found = self.function.evaluated(*columns, costates.state.T, costates.matrices.T)
-        return [stacked(v, self.ends[0].shape[0]) for v in found]
+    def everywhere(self) -> list[ByControls]:
+        """H_u, H_uu and terms of H_u at each place of all intervals."""
+        points, costates = zip(*[self._points(j, self.control(j)) for j in range(self.parts + 1)], strict=True)
+        columns = [np.concatenate(parts, axis=1) for parts in zip(*points, strict=True)]
+        together = Costates(
+            state=np.concatenate([own.state for own in costates]),
+            matrices=np.concatenate([own.matrices for own in costates]),
+        )
+        found = by_controls_at(self.fine.statement, columns, together)
+        return [ByControls(*parts) for parts in zip(*(np.split(v, self.parts + 1) for v in found), strict=True)]
 
     def values(self, j: int, control: Array) -> Array:
         """H there with another control, (N,)."""
@@ -169,13 +171,13 @@ class _Along:
         return columns, Costates(state=costates.state[at], matrices=costates.matrices[at])
 
 
-def _convex(places: Sequence[Sequence[Array]], magnitudes: Array) -> Mask:
+def _convex(places: Sequence[ByControls], magnitudes: Array) -> Mask:
     """Controls of each interval in which H is strictly convex, all of them together, at all places, (N, nu).
 
     Beyond rounding: over the magnitude of a control its slope changes by more than a share of what this is a sum of.
     """
-    bends, terms = (np.array([place[k] for place in places]) for k in (1, 2))
-    beyond = np.diagonal(bends, axis1=2, axis2=3) * magnitudes > ROUNDING * terms[..., 0]
+    bends, terms = np.array([place.curvature for place in places]), np.array([place.sizes for place in places])
+    beyond = np.diagonal(bends, axis1=2, axis2=3) * magnitudes > ROUNDING * terms
     found: Mask = np.all(beyond, axis=0)
     block = np.where(found[:, :, None] & found[:, None, :], bends, np.eye(bends.shape[-1]))
     return np.asarray(found & (np.linalg.eigvalsh(block)[..., :1] > 0).all(axis=0))
@@ -221,15 +223,13 @@ def _around(extremal: Extremal) -> Array:
 
 
 def _by_points(
-    extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask], found: list[list[Array]]
+    extremal: Extremal, along: _Along, convex: Mask, kinds: tuple[Mask, Mask], found: list[ByControls]
 ) -> float:
     """By what is found at the ends and in the middles of the intervals, of the controls in which H is convex."""
     bounds, (free, bounded) = extremal.statement.control_bounds, kinds
     places = [(along.control(j), slope, bend) for j, (slope, bend, _) in enumerate(found)]
-    falls = [
-        np.where(bounded & convex, _fall(u, slope[..., 0], bend, *bounds), 0.0).sum(axis=1) for u, slope, bend in places
-    ]
-    slopes = np.array([np.where(free & convex, slope[..., 0], 0.0) for _, slope, _ in places])
+    falls = [np.where(bounded & convex, _fall(u, slope, bend, *bounds), 0.0).sum(axis=1) for u, slope, bend in places]
+    slopes = np.array([np.where(free & convex, slope, 0.0) for _, slope, _ in places])
     steps = np.linalg.solve(_among(convex, places[1][2]), slopes[..., None])[..., 0]
     gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)
     return float(np.diff(extremal.time) @ (gained + SIMPSON @ np.array(falls)))

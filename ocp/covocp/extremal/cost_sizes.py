@@ -27,7 +27,10 @@ def absolute_cost(extremal: Extremal) -> float:
     """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
     st, t = extremal.statement, extremal.trajectory
     terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())[2]
+    function, columns = "rates", extremal.columns()
+    if st.nominal is not None and not st.running_uses_matrices:  # without the rates of all matrices
+        function, columns = "nominal", (*columns[:2], *columns[3:])
+    running = mapped(st, function, extremal.mesh.intervals + 1).evaluated(*columns)[-1]
     return abs(terminal) + abs(float(np.trapezoid(running.ravel(), extremal.time)))
 
 

@@ -18,9 +18,10 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, read_only
 from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.along_nodes import along_nodes
-from covocp.extremal.costates_in_numbers import costates_in_numbers, has_forms
+from covocp.extremal.costates_in_numbers import costates_in_numbers
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
+from covocp.extremal.forms import has_forms
 from covocp.extremal.hamiltonian import Costates, state_slope
 from covocp.extremal.inside import instant_jumps
 from covocp.passage.columns import in_columns

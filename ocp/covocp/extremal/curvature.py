@@ -19,7 +19,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.buffered import Matrices
 from covocp.base.dataclass import dataclass
 from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
@@ -31,8 +30,8 @@ from covocp.extremal.fine_mesh import refined
 from covocp.extremal.free_starts import free_start, largest, start_weights
 from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.lagrangian import arguments, held_rows, node_size, product_along, second_order, slopes_of_intervals
+from covocp.extremal.metric import Root, mass_matrix
 from covocp.extremal.tangents import Between, Tangents
-from covocp.transcription.mesh import Mesh
 
 LANCZOS_STEPS = 120
 # Residual of the smallest Ritz value, relative to the largest eigenvalue, at which it is known well enough; its sign
@@ -48,8 +47,9 @@ SOLVED = 1e-9
 # Steps of the search for a direction that constraints without multipliers allow; what they may be missed by.
 CONE_STEPS = 60
 CONE_MISS = 1e-9
-# Entries up to which what all directions do to the points is one matrix.
-FEW_ENTRIES = 1_000_000
+# Entries up to which what all directions do to the points is one matrix; up to which nobody waits for products that the
+# library has alone, and how long one of these counts to take [s].
+FEW_ENTRIES, FEW_NUMBERS, LEAST_SECONDS = 1_000_000, 100_000, 1e-6
 
 Verdict = Literal["minimum", "saddle", "flat", "unknown"]
 
@@ -249,7 +249,7 @@ class _Reduced:
     Attributes:
         tangents: from v to nodes and controls.
         between: from there to all points at which limits are imposed, the nodes among them.
-        root: upper triangular R of the metric R' R of v.
+        root: R of the metric R' R of v.
         product: Hessian of the Lagrangian by points and controls there, times a direction of them.
         strict: slopes by v of the rows held with a multiplier, (rows, V), in these units.
         loose: of those without, such that a direction is allowed along which none falls.
@@ -258,7 +258,7 @@ class _Reduced:
 
     tangents: Tangents
     between: Between
-    root: ca.DM
+    root: Root
     product: Callable[[Array], Array]
     strict: Array
     loose: Array
@@ -285,8 +285,10 @@ class _Reduced:
             return None
         between = _between(extremal, fine)
         costates = _costates(fine, through=tangents.gain is None)
-        applied, jacobian, given = product_along(fine, costates, held.entries)
-        once = _seconds(applied, node_size(st) * (fine.mesh.intervals + 1) + fine.trajectory.u.size)
+        applied, jacobian, given, alone = product_along(fine, costates, held.entries)
+        once = LEAST_SECONDS
+        if not alone or fine.trajectory.x.size + fine.trajectory.e.size > FEW_NUMBERS:
+            once = _seconds(applied, node_size(st) * (fine.mesh.intervals + 1) + fine.trajectory.u.size)
         if once * (LEAST_STEPS + _for_units(st.nu, tangents.start)) > seconds:
             raise _TooLongError
         moving = np.flatnonzero(tangents.free).tolist()
@@ -296,15 +298,17 @@ class _Reduced:
             weights = start_weights(extremal, tangents.start, curved, len(moving))
         shares = ca.diag(ca.DM(_shares(fine, applied)[np.array(moving, dtype=np.intp) % st.nu]))
         metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
-        root = _root(ca.diagcat(metric, ca.diag(ca.DM(weights))))
-        rows = _by_v(tangents, *between.backward(*_split(fine, held_rows(jacobian, held.entries, fine, given))), root)
+        root = Root.of(ca.diagcat(metric, ca.diag(ca.DM(weights))))
+        slopes = between.backward(*_split(fine, held_rows(jacobian, held.entries, fine, given)))
+        rows = root.solved(_by_v(tangents, *slopes), turned=True).T
         if not np.isfinite(rows).all():
             return None
         at_bounds = np.flatnonzero(touching * tangents.free)
         units = np.zeros((tangents.free.size, at_bounds.size))
         units[at_bounds, np.arange(at_bounds.size)] = 1.0
         still = np.zeros((mesh.intervals + 1, node_size(st), at_bounds.size))
-        loose = np.vstack([rows[~held.strict], _by_v(tangents, still, units.reshape(*t.u.shape, -1), root)])
+        beside = root.solved(_by_v(tangents, still, units.reshape(*t.u.shape, -1)), turned=True).T
+        loose = np.vstack([rows[~held.strict], beside])
         side = np.concatenate([held.side[~held.strict], touching.ravel()[at_bounds]])
         return _Reduced(
             tangents=tangents,
@@ -318,11 +322,11 @@ class _Reduced:
 
     def unscaled(self, v: Array) -> Array:
         """v of the tangents."""
-        return _solved(self.root, v[:, None])[:, 0]
+        return self.root.solved(v[:, None])[:, 0]
 
     def moved(self, v: Array) -> Array:
         """Changes of points and controls there, one below the other, (rows, m), of v (V, m)."""
-        z, u = self.between.forward(*self.tangents.forward(_solved(self.root, v)))
+        z, u = self.between.forward(*self.tangents.forward(self.root.solved(v)))
         return np.vstack([z.reshape(-1, v.shape[1]), u.reshape(-1, v.shape[1])])
 
     def operator(self, basis: Array) -> Callable[[Array], Array]:
@@ -343,18 +347,18 @@ class _Reduced:
         image = self.product(np.concatenate([z.ravel(), u.ravel()]))
         slopes = self.between.backward(image[: z.size].reshape(z.shape), image[z.size :].reshape(u.shape))
         by_v = self.tangents.backward(*slopes)
-        return _solved(self.root.T, by_v)[:, 0]
+        return self.root.solved(by_v, turned=True)[:, 0]
 
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
-        return null_space(rows, self.root.shape[0])
+        return null_space(rows, self.tangents.size)
 
 
 def _seconds(product: Callable[[Array], Array], size: int) -> float:
     """How long one product with a direction of this size takes [s]."""
     begin = time.perf_counter()
     product(np.zeros(size))
-    return max(time.perf_counter() - begin, float(np.finfo(float).tiny))
+    return max(time.perf_counter() - begin, LEAST_SECONDS)
 
 
 def _for_units(controls: int, start: tuple[int, ...]) -> int:
@@ -393,24 +397,9 @@ def _shares(fine: Extremal, product: Callable[[Array], Array]) -> Array:
     return np.where(roots > 0, roots / own.mean(), 1.0)
 
 
-def _root(metric: ca.DM) -> ca.DM:
-    """Upper triangular R of a sparse matrix R' R."""
-    pivots, upper, _ = ca.ldl(metric, False)
-    return ca.diag(ca.sqrt(pivots)) @ (upper + ca.DM.eye(metric.shape[0]))
-
-
-def _solved(triangular: ca.DM, columns: Array) -> Array:
-    """The inverse of a sparse triangular matrix times some columns."""
-    right = ca.MX.sym("right", *columns.shape)
-    (found,) = Matrices(ca.Function("solved", [right], [ca.solve(triangular, right)])).evaluated(columns)
-    return found
-
-
-def _by_v(tangents: Tangents, by_z: Array, by_u: Array, root: ca.DM) -> Array:
-    """Slopes of rows by v, (rows, V), in units of the root of the metric, from those by nodes and controls."""
-    if not by_z.shape[2]:
-        return np.zeros((0, tangents.size))
-    return _solved(root.T, tangents.backward(by_z, by_u)).T
+def _by_v(tangents: Tangents, by_z: Array, by_u: Array) -> Array:
+    """Slopes of rows by v from those by nodes and controls, (V, rows)."""
+    return tangents.backward(by_z, by_u) if by_z.shape[2] else np.zeros((tangents.size, 0))
 
 
 def _split(extremal: Extremal, rows: Array) -> tuple[Array, Array]:
@@ -472,18 +461,7 @@ def held_jacobian(extremal: Extremal) -> Array:
     tangents = tangents_along(extremal, everything, feedback=False)
     rows = held_rows(jacobian, held.strictly, fine, arguments(fine, _costates(fine, through=True)))
     slopes = _between(extremal, fine).backward(*_split(fine, rows))
-    by_v = _by_v(tangents, *slopes, ca.DM.eye(tangents.size))
+    by_v = _by_v(tangents, *slopes).T
     result = np.zeros((by_v.shape[0], everything.size))
     result[:, everything.ravel()] = by_v
     return result
-
-
-def mass_matrix(mesh: Mesh, duration: float, count: int) -> ca.DM:
-    """The sparse matrix of int du' du dt for the control values, each of `count` entries."""
-    h = np.diff(mesh.nodes) * duration
-    matrix = ca.diag(ca.DM(h))
-    if mesh.control == "linear":
-        n = h.size
-        beside = ca.DM.triplet(list(range(n)), list(range(1, n + 1)), ca.DM(h / 6.0), n + 1, n + 1)
-        matrix = ca.diag(ca.DM(np.append(h, 0.0) + np.append(0.0, h)) / 3.0) + beside + beside.T
-    return ca.kron(matrix, ca.DM.eye(count))

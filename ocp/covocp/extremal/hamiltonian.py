@@ -19,6 +19,7 @@ from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.hamiltonian_in_numbers import ByControls, by_controls_in_numbers, terms_in_numbers
 from covocp.extremal.nodes import mapped
 from covocp.extremal.slope_terms import absolute_terms
 from covocp.statement.interval import model_symbols
@@ -86,6 +87,29 @@ def by_controls(statement: Statement) -> ca.Function:
     return ca.Function("by_controls", symbols, [ca.densify(v) for v in outputs])
 
 
+def by_controls_at(statement: Statement, columns: Sequence[Any], costates: Costates) -> ByControls:
+    """What `by_controls` gives at some points: by numbers where that can be had, else by its function.
+
+    Args:
+        statement: the problem.
+        columns: (x, u, e, t, T, p) of the points, a column each.
+        costates: there.
+    """
+    found = by_controls_in_numbers(statement, columns, costates.state, costates.matrices)
+    if found is not None:
+        return found
+    count = costates.state.shape[0]
+    values = _mapped_by_controls(statement, count).evaluated(*columns, costates.state.T, costates.matrices.T)
+    slope, bend, sizes = (stacked(value, count) for value in values)
+    return ByControls(slope[:, :, 0], bend, sizes[:, :, 0])
+
+
+@lru_cache(maxsize=KEPT)
+def _mapped_by_controls(statement: Statement, count: int) -> Matrices:
+    """`by_controls` at so many points."""
+    return Matrices(by_controls(statement).map(count))
+
+
 def duration_slope(statement: Statement) -> ca.Function:
     """(x, u, e, t, T, p, costate of x, costate of e) -> H_T, where rates or cost contain the duration itself."""
     inner = hamiltonian(statement)("value", lambda h, x, u, e, t: [h])
@@ -110,6 +134,9 @@ def terms_of(statement: Statement, columns: Sequence[Any], costates: Costates) -
         columns: (x, u, e, t, T, p) of the points, a column each.
         costates: there.
     """
+    found = terms_in_numbers(statement, columns, costates.state, costates.matrices)
+    if found is not None:
+        return found
     rates = mapped(statement, "rates", costates.state.shape[0]).evaluated(*columns)
     weighed = [costates.state * rates[0].T, costates.matrices * rates[1].T, rates[2].T]
     return np.concatenate(weighed, axis=1)

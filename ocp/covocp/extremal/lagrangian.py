@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered
-from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.along_nodes import Hessian, along_nodes
@@ -27,6 +26,7 @@ from covocp.statement.conditions import Columns, Conditions, Inside
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.nlp import terminal_bends
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
 from covocp.transcription.staged import interval_transitions, is_staged
 from covocp.transcription.steps import full_interval, interval_slopes, nominal_interval
@@ -86,7 +86,7 @@ def second_order(
         nodes one after the other, then the controls.
     """
     st, n = statement, mesh.intervals
-    curved = bool(st.path.size or st.start.size or st.end.size or st.inside.size) or _terminal(st).curved
+    curved = bool(st.path.size or st.start.size or st.end.size or st.inside.size) or terminal_bends(st).states
     if alone and not curved:  # nor is any row held but states
         return None, None
     size = node_size(st)
@@ -164,25 +164,23 @@ def _passed(
     return e, seen, cost, ends
 
 
-class _Terminal(NamedTuple):
-    """By form: whether the terminal cost's slope by x(T) moves with it, and that by half-vectors with any of both."""
+class Product(NamedTuple):
+    """A product with directions, and the slopes of the rows that are held.
 
-    curved: bool
-    bent: bool
+    Attributes:
+        applied: direction -> the product, NaN where it fails.
+        jacobian: that `second_order` gives.
+        given: its arguments.
+        alone: whether the library has all of it.
+    """
+
+    applied: Callable[[Array], Array]
+    jacobian: ca.Function | None
+    given: tuple[Any, ...]
+    alone: bool
 
 
-@lru_cache(maxsize=4)
-def _terminal(statement: Statement) -> _Terminal:
-    end = statement.terminal
-    symbolic: Any = statement.symbolic
-    x, e, *others = (symbolic.sym(end.name_in(i), end.size1_in(i)) for i in range(end.n_in()))
-    by_x, by_e = slopes_by(end(x, e, *others), (x, e))
-    return _Terminal(bool(ca.depends_on(by_x, x)), bool(ca.depends_on(by_e, ca.vertcat(x, e))))
-
-
-def product_along(
-    extremal: Extremal, costates: Costates, held: Entries
-) -> tuple[Callable[[Array], Array], ca.Function | None, tuple[Any, ...]]:
+def product_along(extremal: Extremal, costates: Costates, held: Entries) -> Product:
     """The Hessian of the Lagrangian along an extremal, times a direction.
 
     Args:
@@ -191,13 +189,13 @@ def product_along(
         held: rows that are held.
 
     Returns:
-        Direction -> the product, NaN where it fails; the Jacobian that `second_order` gives, and its arguments.
+        The product, and the Jacobian of the rows.
     """
     st, given, numbers = extremal.statement, arguments(extremal, costates), _hessian(extremal, costates, held)
     product, jacobian = second_order(st, extremal.mesh, held, alone=numbers is not None)
     if numbers is None:
         assert product is not None
-        return _applied(product, given), jacobian, given
+        return Product(_applied(product, given), jacobian, given, alone=False)
     others = None if product is None else _applied(product, given)
     shape, split = extremal.trajectory.u.shape, extremal.trajectory.x.size
 
@@ -206,7 +204,7 @@ def product_along(
         found = np.concatenate([by_x.ravel(), by_u.ravel()])
         return found if others is None else found + others(direction)
 
-    return product_with, jacobian, given
+    return Product(product_with, jacobian, given, alone=others is None)
 
 
 def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], Array]:
@@ -240,7 +238,7 @@ def _hessian(extremal: Extremal, costates: Costates, held: Entries) -> Hessian |
     if along is None or not along.twice:
         return None
     if st.ne:
-        if _terminal(st).bent:
+        if terminal_bends(st).matrices:
             return None
         weights[-1] += terminal_costates(extremal)[1]
     return Hessian(along, weights, costates.state[1:])

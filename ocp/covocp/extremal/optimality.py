@@ -22,7 +22,7 @@ from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.finer_cost import change_on_finer_mesh
-from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope, terms_of
+from covocp.extremal.hamiltonian import Costates, along, by_controls_at, duration_slope, terms_of
 from covocp.extremal.inside import instant_control_slopes, instant_duration_slope
 from covocp.extremal.jumps import met_jumps
 from covocp.extremal.links import Within
@@ -302,10 +302,9 @@ class _AtNodes(NamedTuple):
 def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     """The Hamiltonian and its slopes at the nodes."""
     st = extremal.statement
-    slope, curvature, size = along(by_controls(st), extremal, costates)
-    curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
+    slope, curvature, size = by_controls_at(st, extremal.columns(), costates)
     terms = terms_of(st, extremal.columns(), costates)
-    sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
+    sizes = slope_sizes(size, curvature, extremal.controls)
     return _AtNodes(slope, curvature, np.column_stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)]), sizes)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.extremal.cost_sizes import absolute_cost, variable_cost
-from covocp.extremal.curvature import Curvature, mass_matrix
+from covocp.extremal.curvature import Curvature
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.metric import mass_matrix
 
 # Share of the cost that is not worth a word: a control that goes from bound to bound between two nodes is between them
 # at a node, where the cost is concave in it; along a singular arc, or beside the bound of a state, zigzags of linear

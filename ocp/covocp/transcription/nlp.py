@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -308,13 +308,34 @@ def terminal_slopes(
     statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array
 ) -> tuple[Array, Array]:
     """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
-    t, function = trajectory, _terminal_slopes(statement)
-    by_x, by_e = function.evaluated(t.x[-1], t.e[-1], t.u[-1], t.duration, parameters, end, path)
+    t, slopes = trajectory, _terminal_numbers(statement)
+    by_x, by_e = slopes.evaluated(t.x[-1], t.e[-1], t.u[-1], t.duration, parameters, end, path)
     return by_x.ravel(), by_e.ravel()
 
 
+class TerminalBends(NamedTuple):
+    """By form: whether the slope of a terminal cost by x(T) moves with it, and that by half-vectors with both."""
+
+    states: bool
+    matrices: bool
+
+
 @lru_cache(maxsize=4)
-def _terminal_slopes(statement: Statement) -> Matrices:
+def terminal_bends(statement: Statement) -> TerminalBends:
+    """Which slopes at T are not constant; those of conditions there count by x(T) where these are curved."""
+    slopes = _terminal_slopes(statement)
+    moves = [[slopes.jac_sparsity(of, by).nnz() > 0 for by in range(2)] for of in range(2)]
+    return TerminalBends(moves[0][0], any(moves[1]))
+
+
+@lru_cache(maxsize=4)
+def _terminal_numbers(statement: Statement) -> Matrices:
+    """`_terminal_slopes` of numbers."""
+    return Matrices(_terminal_slopes(statement))
+
+
+@lru_cache(maxsize=4)
+def _terminal_slopes(statement: Statement) -> ca.Function:
     """(x, e, u at T, T, parameters, multipliers of conditions at the end, of those along the path) -> slopes."""
     x, e, u = (ca.MX.sym(name, size) for name, size in (("x", statement.nx), ("e", statement.ne), ("u", statement.nu)))
     t, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
@@ -323,7 +344,7 @@ def _terminal_slopes(statement: Statement) -> Matrices:
     for conditions, weights in ((statement.end, end), (statement.path, path)):
         if conditions.size:
             value += ca.dot(weights, conditions.function(x, u, e, t, t, p))
-    return Matrices(ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes_by(value, (x, e))))
+    return ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes_by(value, (x, e)))
 
 
 def _fix(lower: Array, upper: Array, values: Array) -> None:
