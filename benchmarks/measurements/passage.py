@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 import covocp as co
-from covocp.extremal import costates, lagrangian
+from covocp.extremal import costates, hamiltonian_in_numbers, lagrangian
 from covocp.models import mars_entry, mass_chain, unknown_lag
 from covocp.passage import library
 from covocp.passage.sweep import passed_by
@@ -89,8 +89,8 @@ def conditions(problem: Callable[[], co.Problem], rounds: int, **options: int) -
             with ExitStack() as patches:
                 for module in () if by_numbers else (costates, lagrangian):
                     patches.enter_context(mock.patch.object(module, "along_nodes", return_value=None))
-                if not by_numbers:
-                    patches.enter_context(mock.patch.object(costates, "has_forms", return_value=False))
+                for module in () if by_numbers else (costates, hamiltonian_in_numbers):
+                    patches.enter_context(mock.patch.object(module, "has_forms", return_value=False))
                 found.append(median_of(lambda own=solution: own.optimality, 1))
         times.append(found)
     return [statistics.median(column) for column in zip(*times, strict=True)]

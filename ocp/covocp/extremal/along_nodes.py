@@ -31,7 +31,7 @@ from covocp.passage.sweep import Course
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import gauss_entries
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.numbers import by_themselves, columns_of_parts
+from covocp.transcription.numbers import by_control_values, by_themselves, columns_of_parts
 from covocp.transcription.shooting import control_ends
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
@@ -119,7 +119,7 @@ class AlongNodes:
             after[k] = keep[:, k] * value + known[:, k]
             result[k] = value = through[k] @ after[k] + own[k] + jumps[k]
         found = Backward.of(self, seeds, after)
-        by_u = by_controls(self.mesh, found.begin, found.end)
+        by_u = by_control_values(self.mesh, found.begin, found.end)
         return Slopes(result, by_u, found.duration + seeds.duration, seeds.kicks)
 
 
@@ -263,21 +263,6 @@ class Backward:
         return Backward(x=carried.T, begin=begin, end=end, duration=duration, seeds=seeds[::-1])
 
 
-def by_controls(mesh: Mesh, begin: Array, end: Array) -> Array:
-    """Slopes by the control values, a row each, of those by the controls at both ends of each substep."""
-    n, m = mesh.intervals, mesh.substeps
-    first, last = begin.T, end.T
-    if m > 1:
-        one, other = first.reshape(n, m, -1), last.reshape(n, m, -1)
-        share = np.arange(m)[:, None] / m
-        first = ((1.0 - share) * one + (1.0 - share - 1.0 / m) * other).sum(axis=1)
-        last = (share * one + (share + 1.0 / m) * other).sum(axis=1)
-    result = np.zeros((mesh.control_nodes, begin.shape[0]))
-    result[:n] += first
-    result[int(mesh.control == "linear") :][:n] += last
-    return mesh.gathered(result)
-
-
 class Ahead:
     """Tangents of the states after all intervals, each from its own node.
 
@@ -361,7 +346,7 @@ class Hessian:
                     whole[:, j::m] += part
         result = np.zeros_like(x)
         result[:n] = np.asarray(carried).T
-        return result, by_controls(self._mesh, total[2], total[3])
+        return result, by_control_values(self._mesh, total[2], total[3])
 
 
 class _Moved:

@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Conditions, Statement
@@ -87,7 +88,7 @@ class _Looks:
 
     def __init__(self, statement: Statement, conditions: Conditions, scales: Scales) -> None:
         self._sizes = scales.x, np.atleast_2d(scales.u).max(axis=0), scales.e
-        self._function, self._variation = conditions.function, _variation(statement, conditions.function)
+        self._rows, self._variation = Matrices(conditions.function), _variation(statement, conditions.function)
         self._duration, self._parameters = scales.duration, statement.values
         self._start, self._end = statement.boundary_values(statement.values)[:2]
         move = np.abs(self._end - self._start)
@@ -124,12 +125,13 @@ class _Looks:
         return [x, side * self._sizes[1], side * self._sizes[2]]
 
     def _value(self, at: list[Array], share: float) -> Array:
-        found = self._function(*at, share * self._duration, self._duration, self._parameters)
-        return np.asarray(found.full()).ravel()
+        (found,) = self._rows.evaluated(*at, share * self._duration, self._duration, self._parameters)
+        return found.ravel()
 
     def _slopes(self, at: list[Array], share: float, states: Array) -> Array:
         others = (share * self._duration, self._duration, self._parameters)
-        return np.asarray(self._variation(*at, *others, states, *self._sizes[1:]).full()).ravel()
+        (found,) = self._variation.evaluated(*at, *others, states, *self._sizes[1:])
+        return found.ravel()
 
 
 def _finite(values: Array) -> Array:
@@ -138,10 +140,10 @@ def _finite(values: Array) -> Array:
 
 
 @lru_cache(maxsize=KEPT)
-def _variation(statement: Statement, function: ca.Function) -> ca.Function:
+def _variation(statement: Statement, function: ca.Function) -> Matrices:
     """(arguments of conditions, magnitudes of x, u and e) -> what each row varies by if all change by these."""
     symbols = model_symbols(statement)
     kind: Any = statement.symbolic
     sizes = [kind.sym(name, size) for name, size in (("dx", statement.nx), ("du", statement.nu), ("de", statement.ne))]
     varied = ca.fabs(ca.jacobian(function(*symbols), ca.vertcat(*symbols[:3]))) @ ca.vertcat(*sizes)
-    return ca.Function("variation", [*symbols, *sizes], [ca.densify(varied)])
+    return Matrices(ca.Function("variation", [*symbols, *sizes], [ca.densify(varied)]))

@@ -156,6 +156,21 @@ def _beside(each: list[Array]) -> Array:
     return np.stack(each, axis=2).reshape(each[0].shape[0], each[0].shape[1] * len(each))
 
 
+def by_control_values(mesh: Mesh, begin: Array, end: Array) -> Array:
+    """Slopes by the control values, a row each, of those by the controls at both ends of each substep."""
+    n, m = mesh.intervals, mesh.substeps
+    first, last = begin.T, end.T
+    if m > 1:
+        one, other = first.reshape(n, m, -1), last.reshape(n, m, -1)
+        share = np.arange(m)[:, None] / m
+        first = ((1.0 - share) * one + (1.0 - share - 1.0 / m) * other).sum(axis=1)
+        last = (share * one + (share + 1.0 / m) * other).sum(axis=1)
+    result = np.zeros((mesh.control_nodes, begin.shape[0]))
+    result[:n] += first
+    result[int(mesh.control == "linear") :][:n] += last
+    return mesh.gathered(result)
+
+
 def by_themselves(statement: Statement, mesh: Mesh) -> bool:
     """Whether all matrices pass along a nominal that is known, by compiled steps of their own alone."""
     st = statement

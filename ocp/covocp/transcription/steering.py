@@ -17,6 +17,7 @@ from covocp.base.short_repr import short_repr
 from covocp.passage.columns import numbers_in_turn
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.end_slopes import end_slopes
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.numbers import columns_of_parts
 from covocp.transcription.shooting import interval_columns
@@ -180,10 +181,13 @@ def _aims(
 
 def final_pull(run: Run, fixed: tuple[int, ...], target: Array, u: Array, often: bool = True) -> tuple[Array, Array]:
     """Miss of the final values of some states in their scales, and its Jacobian by the controls."""
-    aims = _aims(run.statement, run.mesh, (run.mesh.intervals - 1,), fixed, often)
-    value, slope = aims(run.start, u.ravel(), run.duration, run.parameters)
+    found = end_slopes(run.statement, run.mesh, run.start, u, run.duration, run.parameters, fixed)
+    if found is None:
+        aims = _aims(run.statement, run.mesh, (run.mesh.intervals - 1,), fixed, often)
+        value, slope = aims(run.start, u.ravel(), run.duration, run.parameters)
+        found = np.asarray(value.full()).ravel(), np.asarray(slope.full())
     scale = run.divisors[list(fixed)]
-    return (np.asarray(value.full()).ravel() - target) / scale, np.asarray(slope.full()) / scale[:, None]
+    return (found[0] - target) / scale, found[1] / scale[:, None]
 
 
 def in_told_units(run: Run, fixed: tuple[int, ...], plain: Array, often: bool = True) -> Run:
