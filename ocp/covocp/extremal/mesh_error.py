@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.dataclass import dataclass
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.extremal.bends import change_by_bends
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.final_deviations import final_deviations
@@ -191,7 +192,7 @@ def _entry(statement: Statement, row: int) -> str:
 def changes_by_parts(
     extremal: Extremal, running: float, parts: int, within: Within | None = None
 ) -> tuple[float, float, float]:
-    """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
+    """Changes by shorter steps: of the optimal cost, of it without that along the controls, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     finer = parted(extremal, parts)
     jumps = finer.jumps
@@ -206,7 +207,8 @@ def changes_by_parts(
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
     least = LEAST_RANGE * _magnitudes(st, t, tuple(extremal.parameters.tolist())).x
-    return change, _missed(extremal, finer, parts, within), _moved(jumps[:, : st.nx], t.x, least)
+    missed = _missed(extremal, finer, parts, within) - change_by_bends(extremal, finer, parts)
+    return change, missed, _moved(jumps[:, : st.nx], t.x, least)
 
 
 def _halved(extremal: Extremal) -> Refined:
@@ -349,7 +351,7 @@ def finer_steps(
         extremal: a solution on the mesh of the options.
         options: those of this mesh.
         allowed: largest change, relative to the range of each entry.
-        running: the running cost, where the cost of such a gain counts as well.
+        running: the running cost, where the cost of such a gain counts as well, and that of one run along the controls.
 
     Returns:
         None where the steps are short enough, or cannot be shorter.
@@ -388,6 +390,9 @@ def divided(
     )
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
+    if running is not None and not np.any(gaps):  # a square: it falls twice as fast with the steps
+        bent = abs(change_by_bends(extremal, _halved(extremal), 2))
+        times = max(times, (bent / (COARSE_MESH * max(abs(_cost_of_all(extremal, running, None)), NO_COST))) ** 0.5)
     fast = changes_within_steps(extremal)
     if fast and not np.any(gaps):
         times = max(times, _error_of_one(extremal) / COARSE_MESH)
