@@ -23,6 +23,7 @@ from covocp.export.compiled.linking import PLUGINS, Linking
 from covocp.export.laws.conditions import INFEASIBLE, STATIONARY, lagrangian_slope, residuals
 from covocp.export.laws.law import CODES, QUATERNION, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
+from covocp.export.laws.plan_steps import are_long, final_multipliers, limits
 from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
 from covocp.export.laws.solver_bounds import coarse, narrowed, nlp_bounds, outside
 from covocp.export.text.names import identifier
@@ -87,6 +88,7 @@ class _Task:
         unit: of the cost, in which it is judged what counts as solved.
         multipliers: of the solution in units of the NLP, of the variables and of the constraints.
         written: the transcription that is written out, with the passages of its tape; None: `nlp` itself.
+        steps: what halving the steps may change of a plan, of states and of the cost.
     """
 
     made: Replannable
@@ -96,6 +98,7 @@ class _Task:
     unit: float
     multipliers: tuple[Array, Array]
     written: tuple[NLP, Tape] | None
+    steps: Array
 
     __repr__ = short_repr
 
@@ -236,7 +239,14 @@ def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool, c
     timed = any(entry.port.name == "duration" for entry in made.entries)
     multipliers = _multipliers(nlp, solution, scale, timed=timed)
     return _Task(
-        made=made, nlp=nlp, solution=solution, scale=scale, unit=unit, multipliers=multipliers, written=written
+        made=made,
+        nlp=nlp,
+        solution=solution,
+        scale=scale,
+        unit=unit,
+        multipliers=multipliers,
+        written=written,
+        steps=limits(nlp, nlp.pack(solution.trajectory), multipliers[0], scale),
     )
 
 
@@ -323,8 +333,10 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
     violation = ca.fmax(violation, outside(task.nlp, p))
     outputs = _results(task, result["x"], evaluated, (violation, left))
     bad = ca.logic_not(ca.logic_and(violation <= INFEASIBLE, left <= STATIONARY))
-    short = coarse(nlp, p, evaluated)
-    good = CODES["OK"] if short is None else ca.if_else(short, CODES["COARSE"], CODES["OK"])
+    held = final_multipliers(nlp, result["lam_x"], task.scale)
+    long, uncertain = are_long(nlp, p, evaluated, held, task.steps), coarse(nlp, p, evaluated)
+    long = long if uncertain is None else ca.logic_or(long, uncertain)
+    good = ca.if_else(long, CODES["COARSE"], CODES["OK"])
     values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], good)]
     function = ca.Function("solve", [*symbols.values(), guess], [flat(v) for v in values])
     return _Core(function=function, results=(*(port for port, _ in outputs), Port(name="status")))
