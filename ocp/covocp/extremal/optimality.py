@@ -15,7 +15,7 @@ from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.control_error import ACTIVE, estimate_control_error, kinds_of
-from covocp.extremal.cost_sizes import ZERO_COST, absolute_cost, variable_cost
+from covocp.extremal.cost_sizes import RESOLVED, ZERO_COST, absolute_cost, variable_cost
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.decisions import decision_slopes
@@ -164,7 +164,7 @@ def assess(
         stationarity=_stationarity(extremal, _left(extremal), scale, within) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
-        hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
+        hamiltonian_variation=_variation(extremal, values, size) if st.autonomous else None,
         transversality=_transversality(extremal, costates, values, within) if st.duration.free else None,
         mesh_error=mesh_error,
         node_error=node_error(extremal),
@@ -347,10 +347,14 @@ def _of_nothing(found: Optimality) -> Optimality:
     return replace(found, **{name: 0.0 for name in named if getattr(found, name) is not None})
 
 
-def _variation(extremal: Extremal, values: Array) -> float:
-    """Variation of H relative to its terms; where something is read or holds at an instant it may jump."""
+def _variation(extremal: Extremal, values: Array, size: float) -> float:
+    """Variation of H relative to its terms; where something is read or holds at an instant it may jump.
+
+    Terms that are nothing beside the size of the cost over the time are what rounding left of them.
+    """
     largest = float(np.max([np.ptp(values[part, 0]) for part in stretches(extremal)]))
-    return largest / max(float(values[:, 1].max()), np.finfo(float).tiny)
+    least = RESOLVED * size / max(extremal.trajectory.duration, np.finfo(float).tiny)
+    return largest / max(float(values[:, 1].max()), least, np.finfo(float).tiny)
 
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array, within: Within | None) -> float:

@@ -243,13 +243,15 @@ def judge(sample: MonteCarlo) -> Verdict:
     exact = EXACT * largest
     magnitude = np.abs(sample.nominal).max(axis=0, initial=0.0)
     same = np.where(largest <= ROUNDED * magnitude, magnitude, 0.0)
+    # An error that dies out leaves what the steps of runs and nominal differ by, in all runs alike: feedback or not.
+    forgotten = np.where(np.nan_to_num(errors, nan=np.inf) <= ROUNDED * magnitude, magnitude, same)
     to_error = np.hstack([-np.eye(n), np.eye(n)])
     more = (np.diagonal(v) for v in (sample.grown[:n, :n], to_error @ sample.grown @ to_error.T))
     grown, grown_errors = (np.sqrt((v**2 + w).clip(0.0)) for v, w in zip((predicted, errors), more, strict=True))
-    level = (stayed, sample.level, exact, same)
+    level = (stayed, sample.level, exact)
     return Verdict(
-        deviations=_entries(names[:states], predicted, grown, sample.deviations, *level),
-        errors=_entries(names, errors, grown_errors, sample.estimates - sample.deviations, *level)
+        deviations=_entries(names[:states], predicted, grown, sample.deviations, *level, same),
+        errors=_entries(names, errors, grown_errors, sample.estimates - sample.deviations, *level, forgotten)
         if sample.estimated
         else (),
         left=sample.left_share,
