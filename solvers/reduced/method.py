@@ -183,8 +183,8 @@ class ReducedRuns(Runs):
         return self._unit
 
     def _ending(self, name: str) -> Ending | None:
-        """The ending in these words."""
-        return next((status for status in Status if str(status) == name), None)
+        """The ending in these words, or of that name: that iterates diverge is told as of Ipopt."""
+        return next((status for status in Status if str(status) == name), None) or super()._ending(name)
 
 
 class ReducedSolver:

@@ -41,7 +41,7 @@ def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
     monkeypatch.setattr(solver, "PATIENCE", 12)
     found = co.solve(brisk(), **options)
     assert found.cost == pytest.approx(alone.cost, rel=1e-6)
-    assert found.stats["iterations"] > alone.stats["iterations"]
+    assert found.stats["iterations"] > 2 * 12  # of all runs
     largest = found["v"] + 2.0537489 * np.ravel(found.deviation("v"))  # the quantile of 98 %
     assert largest.max() == pytest.approx(1.2, abs=1e-6)
 

@@ -207,7 +207,9 @@ def changes_by_parts(
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
     least = LEAST_RANGE * _magnitudes(st, t, tuple(extremal.parameters.tolist())).x
-    missed = _missed(extremal, finer, parts, within) - change_by_bends(extremal, finer, parts)
+    missed = _missed(extremal, finer, parts, within) - change_by_bends(
+        extremal, finer, parts, _cost_of_all(extremal, running, within)
+    )
     return change, missed, _moved(jumps[:, : st.nx], t.x, least)
 
 
@@ -391,8 +393,9 @@ def divided(
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
     if running is not None and not np.any(gaps):  # a square: it falls twice as fast with the steps
-        bent = abs(change_by_bends(extremal, _halved(extremal), 2))
-        times = max(times, (bent / (COARSE_MESH * max(abs(_cost_of_all(extremal, running, None)), NO_COST))) ** 0.5)
+        cost = _cost_of_all(extremal, running, None)
+        bent = abs(change_by_bends(extremal, _halved(extremal), 2, cost))
+        times = max(times, (bent / (COARSE_MESH * max(abs(cost), NO_COST))) ** 0.5)
     fast = changes_within_steps(extremal)
     if fast and not np.any(gaps):
         times = max(times, _error_of_one(extremal) / COARSE_MESH)

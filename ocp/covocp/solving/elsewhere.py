@@ -117,7 +117,7 @@ class Elsewhere:
             what = f"'{own.sampled[0].name}' is read at instants" if own.sampled else f"'{held[0]}' holds at an instant"
             raise ProblemError(
                 f"{what}, which another duration would have elsewhere.",
-                expected="continuous measurements, and conditions at shares of the duration (relative=True)",
+                expected="continuous measurements (none at=, at shares neither), conditions at shares (relative=True)",
                 received=f"duration={value:g}",
                 remedy="state the problem anew, with the instants that are left",
             )
