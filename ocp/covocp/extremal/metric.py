@@ -27,12 +27,14 @@ class Root:
     """Upper triangular R of a banded matrix R' R.
 
     Attributes:
-        bands: of R, the diagonal last.
-        turned: of R', the diagonal first.
+        diagonal: of R, (V,).
+        above: of each row what stands beside the diagonal, R[i, i + 1], R[i, i + 2], ..., (V, width).
+        beside: of each column what stands above the diagonal, ..., R[i - 2, i], R[i - 1, i], (V, width).
     """
 
-    bands: Array
-    turned: Array
+    diagonal: Array
+    above: Array
+    beside: Array
 
     __repr__ = short_repr
 
@@ -43,26 +45,31 @@ class Root:
         Raises:
             LinAlgError: it is not positive definite.
         """
-        from scipy.linalg import cholesky_banded
-
-        rows, columns = (np.array(place, dtype=np.intp) for place in matrix.sparsity().get_triplet())
-        upper = columns >= rows
-        rows, columns, values = rows[upper], columns[upper], np.array(matrix.nonzeros())[upper]
+        pivots, upper, _ = ca.ldl(matrix, False)
+        squares, size = np.asarray(pivots.full()).ravel(), matrix.shape[0]
+        if not (squares > 0.0).all():
+            raise np.linalg.LinAlgError("the metric is not positive definite")
+        diagonal = np.sqrt(squares)
+        rows, columns = (np.array(place, dtype=np.intp) for place in upper.sparsity().get_triplet())
         width = int((columns - rows).max(initial=0))
-        bands = np.zeros((width + 1, matrix.shape[0]))
-        bands[width + rows - columns, columns] = values
-        bands = cholesky_banded(bands, check_finite=False)
-        turned = np.zeros_like(bands)
-        for apart in range(width + 1):
-            turned[apart, : bands.shape[1] - apart] = bands[width - apart, apart:]
-        return Root(bands=bands, turned=turned)
+        above, beside = np.zeros((2, size, width))
+        above[rows, columns - rows - 1] = beside[columns, width - (columns - rows)] = diagonal[rows] * np.array(
+            upper.nonzeros()
+        )
+        return Root(diagonal=diagonal, above=above, beside=beside)
 
     def solved(self, columns: Array, *, turned: bool = False) -> Array:
         """R^-1 of some columns, or R'^-1."""
-        from scipy.linalg import solve_banded
-
-        if not columns.shape[1]:
-            return columns
-        width = self.bands.shape[0] - 1
-        shape, bands = ((width, 0), self.turned) if turned else ((0, width), self.bands)
-        return np.asarray(solve_banded(shape, bands, columns, check_finite=False))
+        size, width = self.above.shape
+        if not width or not columns.shape[1]:
+            return columns / self.diagonal[:, None]
+        found = columns.astype(float)
+        for i in range(size) if turned else range(size - 1, -1, -1):
+            if turned and i:
+                reach = min(width, i)
+                found[i] -= self.beside[i, width - reach :] @ found[i - reach : i]
+            elif not turned and i < size - 1:
+                reach = min(width, size - 1 - i)
+                found[i] -= self.above[i, :reach] @ found[i + 1 : i + 1 + reach]
+            found[i] /= self.diagonal[i]
+        return found

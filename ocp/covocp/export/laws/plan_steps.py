@@ -41,7 +41,7 @@ def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given)
         held: multipliers of final states that are prescribed, (nx, 1): what it costs to miss them.
     """
     st, mesh = nlp.statement, nlp.mesh
-    if st.coupled or st.nominal is None:
+    if st.coupled or st.nominal is None or not st.nx:
         return ca.MX(ca.DM([0.0, 0.0]))
     x, e, u, duration, running, terminal = evaluated[:6]
     common = interval_columns(mesh, u, duration, p)
