@@ -15,7 +15,14 @@ import covocp as co
 from covocp.base.krylov import krylov
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.optimality import _stationarity, assess
-from covocp.models import brachistochrone, bryson_denham, free_time_integrator, mass_chain, noisy_integrator
+from covocp.models import (
+    brachistochrone,
+    bryson_denham,
+    free_time_integrator,
+    mass_chain,
+    noisy_integrator,
+    unknown_lag,
+)
 
 FORMULATIONS = ("eliminated", "states")
 
@@ -363,3 +370,12 @@ def test_transversality_is_zero_where_a_bound_holds_the_duration():
     held = co.solve(problem(0.7 * free), intervals=40, progress=False)
     assert held.duration == pytest.approx(0.7 * free, rel=1e-5)
     assert held.optimality.transversality == 0.0
+
+
+@pytest.mark.parametrize("intervals", [100, 200])
+def test_a_hamiltonian_that_is_rounding_does_not_vary(intervals: int) -> None:
+    """Of a plant so fast that nothing can be learnt the best control is none: all terms of H are what rounding left."""
+    solver = co.Solver(unknown_lag.problem(weight=10.0), intervals=intervals)
+    solution = solver.solve(means={"b": 10.0}, progress=False)
+    assert solution.cost == pytest.approx(50.0, rel=1e-9)
+    assert solution.optimality.hamiltonian_variation < 1e-3

@@ -10,7 +10,9 @@ from scipy.optimize import brentq
 
 import covocp as co
 from covocp.models import brachistochrone, free_time_integrator, mars_entry, unknown_gain, unknown_lag
+from covocp.solvers.reduced import method as reduced_method
 from covocp.solvers.reduced.subproblem import Quadratic, eased, solved
+from covocp.transcription.mesh import Options
 
 
 def steered(limit: float = np.inf, **options: float) -> co.Problem:
@@ -296,3 +298,12 @@ def test_beside_a_penalty_that_hides_every_step_no_point_is_called_solved() -> N
     found = co.solve(ocp, "reduced", intervals=20, progress=False, allow_failure=True)
     assert not found.converged or found.cost == pytest.approx(1.0, rel=1e-4)
     assert co.solve(ocp, "auto", intervals=20, progress=False).cost == pytest.approx(1.0, rel=1e-4)
+
+
+def test_iterates_that_diverge_are_told_in_words() -> None:
+    """A run that wanders off is ended from outside, by Ipopt's name of it."""
+    statement = unknown_lag.problem().statement()
+    prepared = reduced_method.prepare(statement, Options(intervals=10))
+    ending = prepared._runs._ending("Diverging_Iterates")
+    assert ending is not None
+    assert "diverge" in str(ending)

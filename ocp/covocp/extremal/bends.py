@@ -33,7 +33,7 @@ def change_by_bends(extremal: Extremal, finer: Refined, parts: int, cost: float)
     """By how much one run along the controls with shorter steps costs more than to first order, half to both sides.
 
     Zero where nothing bends, where a feedback holds the nominal, and where the run diverges: that is told otherwise. Of
-    an unstable plant what its segments by themselves are off counts, a few times.
+    an unstable plant what its segments by themselves are off counts, `AMPLIFIED` times.
 
     Args:
         extremal: the trajectory.

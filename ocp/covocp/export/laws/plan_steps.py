@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.base.expressions import Given, sequence_of
 from covocp.base.matrices import Array
+from covocp.export.laws.law import LARGEST
 from covocp.transcription.nlp import NLP
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import full_interval, nominal_interval
@@ -78,7 +79,7 @@ def limits(nlp: NLP, w: Array, of_bounds: Array, scale: float) -> Array:
     held = final_multipliers(nlp, ca.DM(of_bounds), scale)
     evaluated: Any = nlp.evaluate(variables, ca.vertcat(p, 1.0))
     found = ca.Function("told", [variables, p], [changes_by_halves(nlp, p, evaluated, held)])(w, nlp.statement.values)
-    own = np.nan_to_num(np.asarray(found.full()).ravel(), nan=np.inf)
+    own = np.fmin(np.asarray(found.full()).ravel(), LARGEST)  # where that is no number anything that is one is allowed
     return np.asarray(np.maximum([NODES, COST], AS_AT_EXPORT * own))
 
 
