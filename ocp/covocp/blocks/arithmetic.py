@@ -21,8 +21,11 @@ from covocp.blocks.values import is_symbolic
 
 Array = NDArray[Any]
 
-# A reading beyond this, an infinite one or NaN counts as missing: a comparison that holds in C code too.
-LARGEST_READING = 1e300
+# A reading beyond this, an infinite one or NaN counts as missing: a comparison that holds in C code too, where numbers
+# may be of single precision.
+LARGEST_READING = 1e30
+# What is divided by is at least this: a number of single precision, too.
+TINY = 1e-37
 
 
 def precision(*arguments: Any) -> Any:
@@ -182,9 +185,9 @@ def substituted(lower: Array, right: Array) -> Array:
 
 
 def is_there(reading: Expr) -> Any:
-    """1 where a reading is a number, 0 where it is missing (NaN or infinite)."""
+    """1 where a reading is a number, 0 where it is missing (NaN or beyond what counts)."""
     if isinstance(reading, np.ndarray):
-        return np.isfinite(reading).astype(reading.dtype)
+        return (np.abs(reading) <= LARGEST_READING).astype(reading.dtype)
     return ca.fabs(reading) <= LARGEST_READING
 
 

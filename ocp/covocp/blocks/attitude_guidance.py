@@ -19,7 +19,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices
 from covocp.base.short_repr import short_repr
 from covocp.blocks import attitude_filter as filters
-from covocp.blocks.arithmetic import beside, where
+from covocp.blocks.arithmetic import TINY, beside, where
 from covocp.blocks.attitude_filter import Correction, GradientEstimate, Memory
 from covocp.blocks.attitude_options import Options, Settings, settings_of
 from covocp.blocks.checked_function import CheckedFunction
@@ -157,7 +157,7 @@ def unconstrained(*, settings: SettingsName = "recommended", **changes: Unpack[O
 
     def guide(correction: Correction, rotation: Expr) -> tuple[Any, Any, Any]:
         b = correction.gradient
-        length = found.kappa * ca.sqrt(ca.fmax(ca.sumsqr(b), 1e-300))
+        length = found.kappa * ca.sqrt(ca.fmax(ca.sumsqr(b), TINY))
         share = ca.SX(1)
         if found.largest_step is not None:
             share = ca.fmin(share, found.largest_step / length)

@@ -43,7 +43,7 @@ def extended(
         step: sampling time of a continuous f [s], u is held over it; None: f is discrete. See `propagated`.
         substeps: of a step.
         form: of the update, see `update`.
-        missing: "raise": readings are trusted, "skip": a row that is NaN or infinite is no measurement.
+        missing: "raise": readings are trusted, "skip": a row that is NaN, infinite or beyond 1e30 is no measurement.
 
     Returns:
         predict: (x, P[, u]) -> x, P before the next measurement; update: (x, P, y) -> x, P after it.

@@ -37,8 +37,9 @@ from covocp.blocks.rotation_series import (
 from covocp.blocks.scaling import ROUNDOFF
 from covocp.blocks.values import is_symbolic, wrong_argument
 
-# Largest entry of a rotation vector that is taken as it is: its square, and derivatives by it, are numbers.
-LONGEST = 1e100
+# Largest entry of a rotation vector that is taken as it is: its square, and derivatives by it, are numbers, of single
+# precision too.
+LONGEST = 1e18
 
 
 def cross(vector: Expr) -> Any:

@@ -110,7 +110,8 @@ def update_factor(
         H: shape (m, n), or (n,) for one measurement.
         R_factor: any square root of the covariance of the measurement noise, shape (m, m).
         form: of the equations.
-        missing: what a row of y that is NaN or infinite means: "raise": an error, "skip": no measurement of that row.
+        missing: what a row of y that is NaN, infinite or beyond 1e30 means: "raise": an error, "skip": no measurement
+            of that row.
 
     Returns:
         Estimate and lower triangular factor after the measurement.

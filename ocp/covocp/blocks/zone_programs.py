@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from covocp.base.expressions import Expr
-from covocp.blocks.arithmetic import where
+from covocp.blocks.arithmetic import TINY, where
 from covocp.blocks.eigenvalues import symmetric_eigen
 
 # 3^3 active sets, each a few operations, in every halving.
@@ -316,7 +316,7 @@ def _unbounded(cost: _Weighted, rows: Rows, kappa: float) -> Constrained:
 def _weighted(estimate: Expr, covariance: Expr) -> _Weighted:
     eigen = symmetric_eigen(covariance)
     largest = ca.mmax(eigen.values)
-    values = 1 / ca.fmax(eigen.values, ca.fmax(1e-15 * largest, 1e-300))
+    values = 1 / ca.fmax(eigen.values, ca.fmax(1e-15 * largest, TINY))
     return _Weighted(values, eigen.vectors, values * (eigen.vectors.T @ estimate))
 
 

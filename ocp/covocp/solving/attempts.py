@@ -17,6 +17,7 @@ from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.solution.solution import Solution
+from covocp.transcription.starts import completed
 from covocp.transcription.trajectory import Trajectory, between
 
 if TYPE_CHECKING:
@@ -186,27 +187,45 @@ class _Runs:
                 break
             least = min((cost_of(one) for one, _ in self.tried if one.converged), default=np.inf)
             certain = self._led(rival) is not None or (self.trusted and rival.about >= least)
-            if not certain and not (rival.alike and self._falls_to_best(rival)):
-                outcome = self.run(rival)
+            chosen = None if certain else self._on_its_way(rival)
+            if chosen is not None:
+                outcome = self.run(chosen)
                 if outcome is not None and outcome.converged:
                     self.trusted |= _as_told(outcome, rival)
                 elif self.reporter.stop:
                     self.left += 1
 
-    def _falls_to_best(self, rival: Guess) -> bool:
-        """Whether the cost falls all the way from where a rival begins to what was found: there is no other valley.
+    def _on_its_way(self, rival: Guess) -> Guess | None:
+        """From where to run for a rival: None where the cost falls all the way from there to what was found.
 
-        Nothing is known of that where conditions are violated on the way: they may lie between two valleys.
+        A bend that is far too large says nothing of valleys: its own cost falls whatever lies below. Then what was
+        found is turned to the side of the rival, which is as large as it is best on the other one.
         """
         found = [outcome for outcome, _ in self.tried if outcome.converged]
-        if not found:
-            return False
+        if not rival.alike or not found:
+            return rival
         best = min(found, key=cost_of)
-        end, begins = best.extremal.trajectory, rival.trajectory
-        merits = [merit_of(self.prepared, self.values, between(begins, end, share)) for share in ALONG]
-        costs = [*(merit.cost for merit in merits), cost_of(best)]
-        met = max(merit.violation for merit in merits) <= LITTLE
-        return bool(met and np.isfinite(costs).all() and (np.diff(costs) < 0.0).all())
+        place = self._before_a_hump(rival.trajectory, best)
+        turned = _turned(self.tried[0][1].trajectory, rival.trajectory, best) if place is None else None
+        if turned is not None:
+            place = self._before_a_hump(turned, best)
+        return None if place is None else replace(rival, trajectory=place)
+
+    def _before_a_hump(self, begins: Trajectory, best: Outcome) -> Trajectory | None:
+        """Where the cost is least on the straight way to what was found; None where it falls all the way.
+
+        There is no other valley then. Nothing is known of that where conditions are violated on the way, which may lie
+        between two valleys: then the way begins where it does.
+        """
+        way = [between(begins, best.extremal.trajectory, share) for share in ALONG]
+        merits = [merit_of(self.prepared, self.values, place) for place in way]
+        costs = np.array([*(merit.cost for merit in merits), cost_of(best)])
+        if not (max(merit.violation for merit in merits) <= LITTLE and np.isfinite(costs).all()):
+            return begins
+        if (np.diff(costs) < 0.0).all():
+            return None
+        valleys = np.flatnonzero((costs[:-1] <= costs[1:]) & (np.append(np.inf, costs[:-2]) >= costs[:-1]))
+        return way[int(min(valleys, key=lambda k: costs[k]))]
 
     def _led(self, rival: Guess) -> Outcome | None:
         """A run that has come about to where a rival begins."""
@@ -252,6 +271,23 @@ def _with_all(best: Outcome, outcomes: list[Outcome]) -> Outcome:
         return best
     names = [name for name in ("iterations", "solve_seconds") if name in best.stats]
     return with_stats(best, tried=len(outcomes), **{name: sum(one.stats[name] for one in outcomes) for name in names})
+
+
+def _turned(first: Trajectory, rival: Trajectory, best: Outcome) -> Trajectory | None:
+    """What was found with those controls turned to the other side which a rival has there; None where it has none."""
+    extremal, middle = best.extremal, 0.5 * (first.u + rival.u)
+    found = extremal.trajectory
+    if found.u.shape != middle.shape:
+        return None
+    apart, sizes = np.abs(rival.u - first.u).max(axis=0), np.abs(first.u - middle).max(axis=0)
+    across = (apart > 0.0) & (apart >= sizes)
+    if not across.any():
+        return None
+    u = np.where(across, np.clip(2.0 * middle - found.u, *extremal.statement.control_bounds), found.u)
+    start = found.x[0]
+    return completed(
+        extremal.statement, extremal.mesh, extremal.parameters, u, start=start, duration=float(found.duration)
+    )
 
 
 def mention_left(error: OutsideDomainError) -> None:

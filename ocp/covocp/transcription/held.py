@@ -41,11 +41,6 @@ FINAL, HELD = 1e4, 2.0
 BETTER = 1e-3
 # Growth exponent of a nominal over the whole time from which on it is held: by itself it grows a thousand times.
 EXPLOSIVE = 6.9
-# Step of second differences in scales of the states; share of a cost below which they are roundoff; scales by which a
-# state is moved at most.
-DIFFERENCE, CURVED, FAR = 0.1, 1e-9, 1e3
-# Shares of the time at which it is asked what the running cost prefers; share of a slope that is none.
-SHARES, SETTLED = (1.0 / 6.0, 0.5, 5.0 / 6.0), 0.3
 # A run that is held is too dear from so many times the cost of one that by itself goes where it shall, but for a miss.
 DEAR, MISSED = 3.0, 0.3
 # Places along a line at which it is asked what grows.
@@ -141,56 +136,6 @@ def _by_controls(statement: Statement) -> ca.Function:
     assert statement.nominal is not None
     rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
     return ca.Function("by_controls", symbols, [ca.densify(ca.jacobian(rate, symbols[1]))])
-
-
-def preferred(run: Run, u: Array, e: Array, free: Array) -> Array:
-    """Where the cost prefers some states to be, each by itself, from the start of a run on; NaN where it prefers none.
-
-    By second differences of the running cost at some times, in the mean over all of the time, and of the terminal one;
-    the slope must be about nothing there: a cost that falls on and on prefers no place.
-
-    Args:
-        run: its start, scales and parameters.
-        u: control (nu,).
-        e: half-vectors (ne,).
-        free: which states may be elsewhere, (nx,).
-
-    Returns:
-        Places, (nx,).
-    """
-    rows, places = np.flatnonzero(free), np.full(run.start.size, np.nan)
-    cost, bend, slope = _differences(run, run.start, rows, u, e)
-    with np.errstate(all="ignore"):
-        seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
-        moved = np.where(seen, -slope / np.where(seen, bend, 1.0), 0.0)
-    seen &= np.abs(moved) * DIFFERENCE < FAR
-    goal = run.start.copy()
-    goal[rows] += np.where(seen, moved, 0.0) * DIFFERENCE * run.divisors[rows]
-    goal = np.clip(goal, *run.statement.state_bounds)
-    after = _differences(run, goal, rows, u, e)[2]
-    with np.errstate(all="ignore"):
-        seen &= np.abs(after) <= np.maximum(SETTLED * np.abs(slope), DIFFERENCE * bend)
-    places[rows] = np.where(seen, goal[rows], np.nan)
-    return places
-
-
-def _differences(run: Run, x: Array, rows: Any, u: Array, e: Array) -> tuple[Array, Array, Array]:
-    """Costs about a point, second and first differences by some states, by shares of their scales; NaN if they fail."""
-    st, T, p = run.statement, run.duration, run.parameters
-    steps, each = DIFFERENCE * run.divisors, np.arange(rows.size)
-    points = np.tile(x, (1 + 2 * rows.size, 1))
-    points[1 + 2 * each, rows] += steps[rows]
-    points[2 + 2 * each, rows] -= steps[rows]
-    cost = np.full(points.shape[0], np.nan)
-    try:
-        for k, point in enumerate(points):
-            running = [float(st.rates(point, u, e, share * T, T, p)[2]) for share in SHARES]
-            cost[k] = T * np.mean(running) + float(st.terminal(point, e, T, p))
-    except RuntimeError:  # CasADi's, or one of a function that the user gave
-        pass
-    above, below = cost[1::2], cost[2::2]
-    with np.errstate(all="ignore"):
-        return cost, above + below - 2.0 * cost[0], 0.5 * (above - below)
 
 
 def too_dear(run: Run, held: Trajectory, left: Trajectory) -> bool:

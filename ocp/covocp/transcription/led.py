@@ -18,7 +18,8 @@ from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.starts import First, beside_guesses, completed, controls_along, told_run, wanted_end
+from covocp.transcription.preferred import wanted_end
+from covocp.transcription.starts import First, beside_guesses, completed, controls_along, told_run
 from covocp.transcription.trajectory import Trajectory
 
 # A run goes past where a state shall be by more than this share of the way there, or of its size at the ends if more.
@@ -40,7 +41,7 @@ def led(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> Traj
         None where the start is not left to itself, the nominal is affine, nothing says where it shall be, or it goes
         there by itself.
     """
-    if statement.loop is None or own.unbent is None or own.held or not _bends(statement):
+    if statement.loop is None or own.unbent is None or own.held or not bends(statement):
         return None
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
     start, e0 = beside_guesses(statement, mesh, parameters)
@@ -64,7 +65,7 @@ def _runs_past(x: Array, start: Array, end: Array) -> bool:
 
 
 @lru_cache(maxsize=KEPT)
-def _bends(statement: Statement) -> bool:
+def bends(statement: Statement) -> bool:
     """Whether the rates of the nominal are not affine in states and controls."""
     if statement.nominal is None:
         return False

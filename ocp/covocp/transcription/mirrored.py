@@ -43,17 +43,21 @@ def other_sides(
     """
     if stays(statement):
         return _kept(statement, mesh, tuple(parameters), linked)
-    return _made(statement, mesh, parameters, own, linked)
+    return sides_of(statement, mesh, parameters, own, linked=linked)
 
 
 @lru_cache(maxsize=2)
 def _kept(statement: Statement, mesh: Mesh, values: tuple[float, ...], linked: bool) -> tuple[Trajectory, ...]:
     parameters = np.array(values)
-    return _made(statement, mesh, parameters, own_start(statement, mesh, parameters), linked)
+    own = own_start(statement, mesh, parameters)
+    return sides_of(statement, mesh, parameters, own, linked=linked)
 
 
-def _made(statement: Statement, mesh: Mesh, parameters: Array, own: First, linked: bool) -> tuple[Trajectory, ...]:
-    if own.unbent is None or own.held or not own.plain or not learns(statement, linked=linked):
+def sides_of(
+    statement: Statement, mesh: Mesh, parameters: Array, own: First, *, linked: bool
+) -> tuple[Trajectory, ...]:
+    """The same of any start, anew; arguments as of `other_sides`."""
+    if own.unbent is None or own.held or not learns(statement, linked=linked):
         return ()
     bend = own.trajectory.u - own.unbent
     if not np.isfinite(own.trajectory.x).all() or not bend.any():

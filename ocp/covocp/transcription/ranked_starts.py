@@ -19,9 +19,10 @@ from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.led import led
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.mirrored import other_sides
+from covocp.transcription.mirrored import other_sides, sides_of
 from covocp.transcription.path_rows import bulges, course, curved_rows
-from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
+from covocp.transcription.ranking import FINE_STEPS, ROUGH_STEPS, distinct, judged, shapes, unsymmetric
+from covocp.transcription.soft_ends import towards_soft_ends
 from covocp.transcription.starts import (
     First,
     base_run,
@@ -36,9 +37,6 @@ from covocp.transcription.starts import (
 from covocp.transcription.steering import Run, resampled
 from covocp.transcription.trajectory import Trajectory
 
-# Steps of each start before the first ranking, and of those that are left after it.
-ROUGH_STEPS = 6
-FINE_STEPS = 20
 # Intervals of the mesh on which ways round obstacles are looked for.
 DETOURS = 40
 # Shares of the bend at which to look for what lies between the bent and the unbent run, and the largest that a start
@@ -49,8 +47,8 @@ SHARES, KEPT_BEND = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), 1 / 16
 def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool = False) -> Iterator[First]:
     """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
 
-    Before them come the ways round what they run through, the cheapest first, and a start that is led where a loop
-    shall be: rivals of what comes of the others.
+    Before them come the ways round what they run through and to where the cost prefers states to end, the cheapest
+    first, and a start that is led where a loop shall be: rivals of what comes of the others.
     `linked`: one of several phases.
 
     Raises:
@@ -68,6 +66,11 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array, *, linked: bool 
         return
     found = list(_others(statement, mesh, parameters, own.trajectory))
     yield from _rivals(statement, mesh, parameters, own, [first.trajectory for first in found], linked=linked)
+    if found and own.unbent is not None:
+        flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+        found[0] = replace(
+            found[0], sides=sides_of(statement, mesh, parameters, replace(found[0], unbent=flat), linked=linked)
+        )
     yield from found or [own]
 
 
@@ -104,6 +107,8 @@ def _rivals(
     found: list[First] = []
     with suppress(np.linalg.LinAlgError, RuntimeError):  # what CasADi raises is a RuntimeError
         found += list(_ways_round(statement, mesh, parameters, own, others))
+    with suppress(np.linalg.LinAlgError, RuntimeError):
+        found += list(towards_soft_ends(statement, mesh, parameters, own))
     with suppress(np.linalg.LinAlgError, RuntimeError):
         straight = None if linked else led(statement, mesh, parameters, own)
         found += [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True, alike=True)]

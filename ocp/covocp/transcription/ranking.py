@@ -29,6 +29,8 @@ SIZES = (1.0, 3.0)
 SIGNS = (1.0, -1.0)
 # Controls that are bent apart from each other; more than these are bent together.
 APART = 2
+# Steps of each start before the first ranking, and of those that are left after it.
+ROUGH_STEPS, FINE_STEPS = 6, 20
 # A start counts as feasible up to this miss of final values and conditions, in their scales.
 FEASIBLE = 1e-2
 # Relative difference of costs below which two starts are one; starts that are kept at most.
@@ -47,11 +49,16 @@ class Judged:
     __repr__ = short_repr
 
 
-def judged(run: Run, fixed: tuple[int, ...], target: Array, shape: Array, flat: Array, steps: int) -> Judged:
-    """Controls near a shape, brought to the final values with little energy."""
+def judged(
+    run: Run, fixed: tuple[int, ...], target: Array, shape: Array, flat: Array, steps: int, soft: tuple[int, ...] = ()
+) -> Judged:
+    """Controls near a shape, brought to the final values with little energy; those of some (soft) may be missed."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable nominal grows beyond what can be squared
         u, miss = least_energy(run, fixed, target, shape, flat, steps) if fixed else (shape, 0.0)
         cost, violation = merit(run, u)
+        if soft:
+            missed = (run.states(u)[-1, list(fixed)] - target) / run.divisors[list(fixed)]
+            miss = float(np.abs(missed[[row not in soft for row in fixed]]).max(initial=0.0))
     violation = max(violation, miss)
     return Judged(u=u, cost=cost, violation=violation if violation > FEASIBLE else 0.0)
 

@@ -36,9 +36,10 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
-from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred, too_dear
+from covocp.transcription.held import Held, aim, excited, in_moving_units, too_dear
 from covocp.transcription.mesh import Mesh, Options, explicit_substeps
 from covocp.transcription.noticed import looks_wrong, noticed_units
+from covocp.transcription.preferred import wanted_end
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import FAR_UNIT, Run, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
@@ -286,21 +287,6 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     run = in_moving_units(run, line, flat)
     bend = (bent - flat) * np.where(untold_controls(statement, flat), run.units, 1.0)
     return excited(run, line, aimed, flat, bend)
-
-
-def wanted_end(run: Run, u: Array, e: Array) -> Array:
-    """Where the states shall be in the end (nx,): final values, else where the cost prefers each; NaN: nothing tells.
-
-    Args:
-        run: its start, scales and parameters.
-        u: control (nu,).
-        e: half-vectors (ne,).
-    """
-    statement, target = run.statement, run.statement.boundary_values(run.parameters)[1]
-    free = np.isnan(target)
-    for block in statement.states:
-        free[block.span] &= block.role == "moving" and not block.tangent
-    return np.where(np.isnan(target), preferred(run, u, e, free), target)
 
 
 def followed_states(statement: Statement) -> tuple[int, ...]:

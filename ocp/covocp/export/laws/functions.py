@@ -136,7 +136,7 @@ def _limits(ports: tuple[Port, ...], ranges: Mapping[str, Any]) -> dict[str, tup
 
 
 def _points(ports: tuple[Port, ...], limits: Mapping[str, tuple[Array, Array]]) -> Points:
-    """Zero (square matrices: unity), ones, both ends of the ranges, large numbers, NaN, then random points."""
+    """Zero, ones, large numbers (square matrices: times unity), both ends of the ranges, NaN, then random points."""
 
     def edge(kind: int) -> Array:
         parts = []
@@ -146,7 +146,11 @@ def _points(ports: tuple[Port, ...], limits: Mapping[str, tuple[Array, Array]]) 
             square = plain and port.rows == port.columns > 1
             unit = np.eye(port.rows).ravel() if square else np.ones(port.size)
             parts.append(
-                [unit if square else low, high if not square else 2.0 * unit, (1e6 if plain else 1.0) * high][kind]
+                [
+                    unit if square else low,
+                    high if not square else 2.0 * unit,
+                    (1e6 if plain else 1.0) * (unit if square else high),
+                ][kind]
             )
         return np.concatenate([np.zeros(0), *parts])
 
