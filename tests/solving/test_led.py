@@ -70,7 +70,7 @@ def test_the_cheaper_minimum_is_found_and_costs_what_scipy_finds() -> None:
     found = solver.solve(progress=False)
     path = np.array([1.46, 0.9, 0.35, -0.17, -0.78, -0.98])
     swinging = solver.solve(guess={"x": path}, progress=False, assess=False)
-    assert found.stats["tried"] == 2
+    assert found.stats["tried"] >= 2
     assert found.cost < 0.75 * swinging.cost
     for one in (found, swinging):
         assert one.cost == pytest.approx(expected_cost(one), rel=1e-4)
@@ -130,4 +130,5 @@ def test_a_start_that_cannot_be_made_is_left_out(monkeypatch: pytest.MonkeyPatch
         raise RuntimeError("the model has no value on that line")
 
     monkeypatch.setattr(ranked_starts, "led", fails)
+    monkeypatch.setattr(ranked_starts, "sides_of", lambda *_, **__: ())
     assert "tried" not in co.solve(van_der_pol((1.0, 0.0)), progress=False).stats

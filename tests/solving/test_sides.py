@@ -259,3 +259,23 @@ def test_a_free_duration_does_not_end_where_nothing_is_learnt(weight):
     run = solve_ivp(rate, (0, 12.0), [0.0, 0.1, 0.0, 0.5], t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.05)
     reference = (0.02 * times + weight * run.y[3]).min()
     assert co.solve(ocp, points=2, progress=False).cost <= reference * (1 + 1e-3)  # whose switches are no nodes
+
+
+def swung(unit: float) -> co.Problem:
+    """A pendulum of unknown stiffness that nobody pushes yet; its control in some unit."""
+    ocp = co.Problem(6.0)
+    x, v = ocp.state("x", initial=0.5, variance=0.5), ocp.state("v", initial=0.2, variance=1.5)
+    b, u = ocp.unknown("b", mean=0.5, variance=2.0), ocp.control("u")
+    ocp.dynamics(x, v, noise=0.01)
+    ocp.dynamics(v, -1.5 * b * ca.sin(x) - 0.3 * v + u / unit, noise=0.01)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize(running=0.25 * (u / unit) ** 2, terminal=8.0 * ocp.estimation_covariance()[b, b])
+    return ocp
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+@pytest.mark.parametrize("unit", [0.1, 1.0, 10.0])
+def test_the_other_side_is_found_in_any_unit_of_the_control(unit, method):
+    """A bend that is far too large costs less and less all the way down; there are valleys on both sides below it."""
+    least = min(co.solve(swung(1.0), method, guess={"u": np.tile(side, 41)}, **OPTIONS).cost for side in (0.3, -0.3))
+    assert co.solve(swung(unit), method, **OPTIONS).cost < least * 1.001

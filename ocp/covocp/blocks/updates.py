@@ -105,8 +105,8 @@ def update(
         H: shape (m, n), or (n,) for one measurement.
         R: covariance of v, positive semidefinite, shape (m, m).
         form: of the equations.
-        missing: what a row of y that is NaN, infinite or beyond 1e30 means: "raise": an error (an expression is trusted),
-            "skip": no measurement of that row.
+        missing: what a row of y that is NaN, infinite or beyond 1e30 means: "raise": an error (an expression is
+            trusted), "skip": no measurement of that row.
 
     Returns:
         Estimate and covariance after the measurement, in the shapes of the arguments; numeric covariances are positive

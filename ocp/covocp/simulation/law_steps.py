@@ -23,7 +23,7 @@ from covocp.simulation.vectorised import Columns
 WINDOW, WINDOWS, MARGIN = 2.0, 1024, 2
 # Steps that a law may ask for, at most.
 MOST_STEPS = 1_000_000
-# Length of a step times the fastest rate of the loop: noise that is held over it then leaves a mode's variance 0.33 % too
+# Length of a step times the fastest rate of the loop: noise that is held over it leaves a mode's variance 0.33 % too
 # small, by (tanh x) / x of half of that; classical Runge-Kutta errs by less, and is stable up to 2.78.
 RESOLVED, STABLE = 0.2, 2.78
 # The loop is looked at in so many of the runs, again after so many steps: an extended filter may be fast at first.
@@ -126,7 +126,7 @@ class Pace:
         return (end - time) / count, taken
 
     def _affordable(self, wanted: float, fastest: float, rest: float) -> float:
-        """A length that leaves steps for the rest of the time, or is for what may die out; the given one if none does."""
+        """A length that leaves steps for the rest, or is for what may die out; the given one if none does."""
         if rest <= wanted * max(self._left, 1) or self._left > self._all - OF_TRANSIENTS:
             return wanted
         even = rest / max(self._left, 1)
@@ -154,8 +154,9 @@ class Pace:
             else "what is so fast grows without end, which the loop itself need not do"
         )
         warn_user(
-            f"The loop has rates of {self.rate:.2g} per s, for which runs with noise would take more than {MOST_STEPS:g} "
-            f"steps; they are {length:.2g} s long, and {wrong}. Simulate a shorter duration, or leave out what is so fast."
+            f"The loop has rates of {self.rate:.2g} per s, for which runs with noise would take more than "
+            f"{MOST_STEPS:g} steps; they are {length:.2g} s long, and {wrong}. Simulate a shorter duration, or leave out "
+            "what is so fast."
         )
 
 

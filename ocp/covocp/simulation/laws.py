@@ -128,8 +128,8 @@ def simulate_law(
         samples: K, number of times, from 0 to the duration.
         breaks: times at which the law or its derivatives jump [s].
         runs: number of runs; None: one without noise.
-        step: of the runs with noise, at most [s]; shorter where the law changes with the time faster, and where the loop
-            is fast: a fifth of the time of its fastest mode, whose variance is then right to 0.4 %.
+        step: of the runs with noise, at most [s]; shorter where the law changes with the time faster, and where the
+            loop is fast: a fifth of the time of its fastest mode, whose variance is then right to 0.4 %.
         process_noise: power spectral density, (n, n), or a number times the identity.
         measurement_noise: power spectral density, (p, p), or a number times the identity.
         seed: of the noise.

@@ -100,7 +100,7 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
 def _rivals(
     statement: Statement, mesh: Mesh, parameters: Array, own: First, others: list[Trajectory], *, linked: bool
 ) -> list[First]:
-    """Starts of which what comes of them is compared; a loop that is one of several phases is not led.
+    """Starts of which what comes of them is compared; one of several phases is not led, nor steered to its soft ends.
 
     None where a number of the search has no value: the other starts are as good without it.
     """
@@ -108,7 +108,7 @@ def _rivals(
     with suppress(np.linalg.LinAlgError, RuntimeError):  # what CasADi raises is a RuntimeError
         found += list(_ways_round(statement, mesh, parameters, own, others))
     with suppress(np.linalg.LinAlgError, RuntimeError):
-        found += list(towards_soft_ends(statement, mesh, parameters, own))
+        found += [] if linked else list(towards_soft_ends(statement, mesh, parameters, own))
     with suppress(np.linalg.LinAlgError, RuntimeError):
         straight = None if linked else led(statement, mesh, parameters, own)
         found += [] if straight is None else [First(trajectory=straight, plain=own.plain, rival=True, alike=True)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from covocp.transcription.first_guess import controls_guess, is_plain
 from covocp.transcription.led import bends
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.preferred import wanted_end
-from covocp.transcription.ranking import FINE_STEPS, ROUGH_STEPS, distinct, judged, shapes, unsymmetric
+from covocp.transcription.ranking import FINE_STEPS, ROUGH_STEPS, distinct, judged, merit, shapes, unsymmetric
 from covocp.transcription.starts import (
     PLAIN_MISS,
     First,
@@ -34,8 +35,9 @@ from covocp.transcription.steering import Run, resampled, steer
 
 # Share of its scale by which a state ends beside where the cost prefers it, left to itself, for it to be steered there.
 LEFT = 0.3
-# Starts of which what comes of them is compared.
-COMPARED = 3
+# Starts of which what comes of them is compared; none that costs so many times what the problem's own start does, or
+# goes so many times farther.
+COMPARED, DEAR, FARTHER = 3, 10.0, 1e4
 
 
 def towards_soft_ends(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> Iterator[First]:
@@ -48,10 +50,11 @@ def towards_soft_ends(statement: Statement, mesh: Mesh, parameters: Array, own: 
         own: the problem's own start.
 
     Yields:
-        Rivals of it, the cheapest first. None where a feedback holds it, or guesses say how something moves.
+        Rivals of it, the cheapest first. None where a feedback holds it, guesses say how something moves, or of a loop,
+        which is led there (`led`).
     """
     plain = all(is_plain(statement.guesses[b.name]) for b in statement.controls) and not followed_states(statement)
-    if not plain or own.held or own.unbent is None or not bends(statement):
+    if not plain or own.held or own.unbent is None or statement.loop is not None or not bends(statement):
         return
     coarse = coarse_mesh(statement, mesh, tuple(parameters))
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
@@ -70,9 +73,20 @@ def towards_soft_ends(statement: Statement, mesh: Mesh, parameters: Array, own: 
     each = shapes(run, flat, resampled(own.trajectory.u, mesh, coarse))
     best = distinct([judged(run, fixed, target, shape, flat, ROUGH_STEPS, soft) for shape in each])
     best = distinct([*best, *(judged(run, fixed, target, entry.u, flat, FINE_STEPS, soft) for entry in best)])
-    for entry in best[:COMPARED]:
-        u = run.clip(resampled(unsymmetric(run, entry.u, flat), coarse, mesh))
+    bent = (run.clip(unsymmetric(run, entry.u, flat)) for entry in best)
+    first = run.clip(resampled(own.trajectory.u, mesh, coarse))
+    for u in islice((u for u in bent if _is_no_worse(run, u, first)), COMPARED):
+        u = run.clip(resampled(u, coarse, mesh))
         yield First(trajectory=completed(statement, mesh, parameters, u), plain=own.plain, rival=True)
+
+
+def _is_no_worse(run: Run, u: Array, own: Array) -> bool:
+    """Whether a start neither costs far more than the problem's own one nor goes far beyond it and the targets."""
+    x, beside = run.states(u), np.abs(run.states(own)).max(axis=0)
+    known = np.maximum(run.divisors, np.where(np.isfinite(beside), beside, 0.0))
+    if not (np.abs(x).max(axis=0) <= FARTHER * known).all():
+        return False
+    return merit(run, u)[0] <= DEAR * abs(merit(run, own)[0])
 
 
 def _misses(run: Run, flat: Array, soft: list[int], end: Array) -> bool:
