@@ -240,3 +240,27 @@ def test_where_no_feedback_can_help_no_other_way_is_tried_or_named(options):
     assert "may find a way" not in str(caught.value)
     assert "found nothing either" not in str(caught.value)
     assert "other_ways" not in caught.value.solution.stats
+
+
+def test_a_gain_of_a_structure_that_fails_by_steps_of_rk4_is_found_by_gauss_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It has no best gain to start from. What fails by itself takes hundreds of iterations: here it is cut short."""
+    own = solver.from_starts
+
+    def cut(prepared, values, guesses, reporter):
+        return own(prepared, values, guesses, Progress("", show=False, iterations=5, within=reporter))
+
+    monkeypatch.setattr(solver, "from_starts", cut)
+    ocp = co.Problem(2.0)
+    x, b = ocp.state("x", initial=0.2, final=0.2, variance=0.4), ocp.unknown("b", mean=0.9, variance=0.9)
+    u = ocp.control("u")
+    ocp.dynamics(x, u - b * x, noise=0.02)
+    ocp.measurement("m", x, noise=0.05)
+    gain = co.Gain(structure=[[1, 0]])
+    ocp.minimize_expected(running=0.3 * u**2 + 0.5 * x**2, terminal_weight={x: 1.7}, gain=gain)
+    found = co.solve(ocp, intervals=20, progress=False)
+    assert "covariance_step='gauss'" in str(found)
+    monkeypatch.undo()
+    by_gradient = co.solve(ocp, "gradient", intervals=20, progress=False)
+    assert found.cost == pytest.approx(by_gradient.cost, rel=1e-4)

@@ -155,8 +155,8 @@ class Pace:
         )
         warn_user(
             f"The loop has rates of {self.rate:.2g} per s, for which runs with noise would take more than "
-            f"{MOST_STEPS:g} steps; they are {length:.2g} s long, and {wrong}. Simulate a shorter duration, or leave out "
-            "what is so fast."
+            f"{MOST_STEPS:g} steps; they are {length:.2g} s long, and {wrong}. Simulate a shorter duration, or leave "
+            "out what is so fast."
         )
 
 

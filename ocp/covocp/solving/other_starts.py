@@ -25,7 +25,7 @@ from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, rank, with_stats
 from covocp.solving.classical_runs import ClassicalRuns
 from covocp.solving.failure import passed_at_the_start, with_stalled
-from covocp.solving.gain_start import GainStart, beyond
+from covocp.solving.gain_start import GainStart, beyond, free_gain_block
 from covocp.solving.methods import method_options
 from covocp.solving.warm_start import Later
 from covocp.statement.statement import Statement
@@ -194,6 +194,21 @@ class OtherStarts(ClassicalRuns):
 
         given = (self._solved, self._options, self._ready, self._other_ways, failed, (best, near), reporter)
         outcome, kept = by_any_way(*given, further=not beyond(self._problem.declarations, best))
+        if kept is not None:
+            self._keep_way(*kept)
+        return outcome
+
+    def _by_other_steps(self, failed: Outcome, guess: Given, reporter: Progress) -> Outcome:
+        """Solved by Gauss steps where a gain without a best one, as of a structure, fails; else as it failed."""
+        if free_gain_block(self._solved) is None:
+            return failed
+        from covocp.solving.other_ways import by_other_ways
+
+        def ready(way: Way) -> Prepared:
+            return self._ready(replace(self._options, **way.mesh), **way.own)
+
+        ways = [way for way in self._other_ways() if way.mesh]
+        outcome, kept = by_other_ways(failed, guess, ways, ready, reporter)
         if kept is not None:
             self._keep_way(*kept)
         return outcome

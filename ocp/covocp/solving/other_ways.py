@@ -13,10 +13,10 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from covocp.base.errors import CovocpError
+from covocp.base.expressions import Given
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.solution.report import OTHERWISE
-from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, rank, with_stats
 from covocp.solving.from_best_gain import part
 from covocp.solving.warm_start import make_guess
@@ -62,7 +62,7 @@ def other_ways(
 
 
 def by_other_ways(
-    failed: Outcome, near: Solution, ways: Iterable[Way], ready: Callable[[Way], Prepared], reporter: Progress
+    failed: Outcome, near: Given, ways: Iterable[Way], ready: Callable[[Way], Prepared], reporter: Progress
 ) -> tuple[Outcome, tuple[Way, Prepared] | None]:
     """The outcome of the first way that finds one, and the way made ready; else as it failed, and None.
 
@@ -71,7 +71,7 @@ def by_other_ways(
 
     Args:
         failed: the run before.
-        near: where to start, as that run did.
+        near: where to start, as that run did: a solution or a guess.
         ways: to try.
         ready: makes the problem ready that way.
         reporter: of iterations.
