@@ -18,6 +18,7 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess, Merit, Outcome, Prepared
 from covocp.solution.solution import Solution
 from covocp.transcription.starts import completed
+from covocp.transcription.steering import nominal_states
 from covocp.transcription.trajectory import Trajectory, between
 
 if TYPE_CHECKING:
@@ -283,11 +284,14 @@ def _turned(first: Trajectory, rival: Trajectory, best: Outcome) -> Trajectory |
     across = (apart > 0.0) & (apart >= sizes)
     if not across.any():
         return None
-    u = np.where(across, np.clip(2.0 * middle - found.u, *extremal.statement.control_bounds), found.u)
-    start = found.x[0]
-    return completed(
-        extremal.statement, extremal.mesh, extremal.parameters, u, start=start, duration=float(found.duration)
-    )
+    st, mesh, parameters = extremal.statement, extremal.mesh, extremal.parameters
+    u = np.where(across, np.clip(2.0 * middle - found.u, *st.control_bounds), found.u)
+    start, duration = found.x[0], float(found.duration)
+    try:
+        x = nominal_states(st, mesh, start, u, duration, parameters)
+        return completed(st, mesh, parameters, u, start=start, duration=duration, x=x)
+    except (ProblemError, RuntimeError):  # the model has no values there; CasADi's
+        return None
 
 
 def mention_left(error: OutsideDomainError) -> None:

@@ -19,9 +19,9 @@ from covocp.transcription.steering import Run
 # Step of second differences in scales of the states; share of a cost below which they are roundoff; steps by which a
 # state is moved at most.
 DIFFERENCE, CURVED, FAR = 0.1, 1e-9, 1e4
-# Where a step is lost in the rounding of the cost, in units far smaller than what it is about, it is so many times
-# longer, so often.
-LONGER, TIMES = 1e3, 3
+# Where a step is lost in the rounding of the cost, or the way is many steps, in units far smaller than what it is
+# about, it is asked again with steps so many times as long.
+LONGER = 1e5
 # Shares of the time at which it is asked what the running cost prefers; share of a slope that is none.
 SHARES, SETTLED = (1.0 / 6.0, 0.5, 5.0 / 6.0), 0.3
 
@@ -71,29 +71,31 @@ def preferred(statement: Statement, at: At, scale: Array, free: NDArray[np.bool_
         Places, (nx,).
     """
     places = np.full(at.x.size, np.nan)
-    left, step = np.flatnonzero(free & _weighed(statement)), DIFFERENCE * scale
-    for _ in range(TIMES):
-        if not left.size:
-            break
-        places[left] = _places(statement, at, left, step)
-        left, step = left[np.isnan(places[left])], LONGER * step
+    rows, steps = np.flatnonzero(free & _weighed(statement)), DIFFERENCE * scale
+    if rows.size:
+        places[rows], short = _places(statement, at, rows, steps)
+        if (again := rows[short]).size:
+            places[again] = _places(statement, at, again, LONGER * steps)[0]
     return places
 
 
-def _places(statement: Statement, at: At, rows: NDArray[np.intp], steps: Array) -> Array:
-    """Where the cost prefers some states (rows) to be, by differences of some steps (nx,)."""
+def _places(statement: Statement, at: At, rows: NDArray[np.intp], steps: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the cost prefers some states (rows) to be, by differences of some steps (nx,), and which are too short."""
     cost, bend, slope = _differences(statement, at, rows, steps)
     with np.errstate(all="ignore"):
         seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
+        short = np.isfinite(bend) & (np.abs(bend) <= CURVED * np.abs(cost).max(initial=0.0))
         moved = np.where(seen, -slope / np.where(seen, bend, 1.0), 0.0)
-    seen &= np.abs(moved) < FAR
+    far = np.abs(moved) >= FAR
+    short |= seen & far
+    seen &= ~far
     goal = at.x.copy()
     goal[rows] += np.where(seen, moved, 0.0) * steps[rows]
     goal = np.clip(goal, *statement.state_bounds)
     after = _differences(statement, replace(at, x=goal), rows, steps)[2]
     with np.errstate(all="ignore"):
         seen &= np.abs(after) <= np.maximum(SETTLED * np.abs(slope), DIFFERENCE * bend)
-    return np.where(seen, goal[rows], np.nan)
+    return np.where(seen, goal[rows], np.nan), short
 
 
 def _differences(statement: Statement, at: At, rows: NDArray[np.intp], steps: Array) -> tuple[Array, Array, Array]:
