@@ -16,6 +16,9 @@ from covocp.solving import classical_runs, other_ways, solver
 from covocp.solving.other_ways import Way, by_other_ways
 
 INTERVALS = {"intervals": 30, "progress": False}
+# On long rk4 steps the optimum may be a saddle by 1e-5 of its largest curvature; whether it is seen depends on the time
+# that there is for the look.
+pytestmark = pytest.mark.filterwarnings("ignore:This is no minimum")
 
 
 # For each of these rounding decides whether an approximate Hessian leads to the optimum on long rk4 steps.
@@ -71,10 +74,9 @@ def by_hessian(method):
     for duration in DURATIONS:
         try:
             found = solved_twice(duration, method, RK4, 0.0)
-            told = str(found.first)
-        except (co.SolveError, co.CovocpWarning):  # where it ends is a saddle to rounding: another duration is none
+        except co.SolveError:
             continue
-        if "found by hessian='limited-memory'" in told:
+        if "found by hessian='limited-memory'" in str(found.first):
             return replace(found, best=co.solve(swung(duration, limited=False), **INTERVALS).cost)
     raise AssertionError("the approximate Hessian finds the optimum for none of the durations")
 
