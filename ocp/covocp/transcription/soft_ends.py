@@ -37,7 +37,7 @@ from covocp.transcription.steering import Run, resampled, steer
 LEFT = 0.3
 # Starts of which what comes of them is compared; none that costs so many times what the problem's own start does, or
 # goes so many times farther.
-COMPARED, DEAR, FARTHER = 3, 10.0, 1e4
+COMPARED, DEAR, FARTHER = 2, 10.0, 1e4
 
 
 def towards_soft_ends(statement: Statement, mesh: Mesh, parameters: Array, own: First) -> Iterator[First]:
