@@ -60,7 +60,17 @@ def seeing_steps(control: ca.Function, start: Array, times: Array, steps: int) -
 
 
 def on_columns(function: Columns, state: Array, t: float | tuple[float, float], *shocks: Array) -> Array:
-    """Values of a vectorised function of columns, with the time (and the length of the step) in common."""
+    """Values of a vectorised function of columns, with the time (and the length of the step) in common.
+
+    Args:
+        function: made ready; its second input is shared by all columns.
+        state: a column for each run, (total, runs).
+        t: time, or time and length of the step [s].
+        shocks: further inputs, a column for each run.
+
+    Returns:
+        Its first output, a column for each run.
+    """
     count = state.shape[1]
     function.inputs[1][:] = t
     for memory, given in zip((function.inputs[0], *function.inputs[2:]), (state, *shocks), strict=True):
@@ -71,7 +81,14 @@ def on_columns(function: Columns, state: Array, t: float | tuple[float, float], 
 
 
 def held_noise_step(rate: ca.Function) -> Callable[..., Any]:
-    """One classical step with the noise held; at its ends a law that jumps there has the value that it has within."""
+    """One classical step with the noise held; at its ends a law that jumps there has the value that it has within.
+
+    Args:
+        rate: (state of the loop, t, process noise, measurement noise) -> its rate.
+
+    Returns:
+        (state, [t, length of the step], process noise, measurement noise) -> state after the step.
+    """
 
     def advance(state: Given, at: Given, process: Given, measurement: Given) -> Any:
         t, h = at[0], at[1]
@@ -88,12 +105,11 @@ def held_noise_step(rate: ca.Function) -> Callable[..., Any]:
 class Pace:
     """Lengths of steps by how fast the loop is where some of the runs are."""
 
-    def __init__(self, rate: ca.Function, size: int, times: Array, step: float) -> None:
+    def __init__(self, rate: ca.Function, times: Array, step: float) -> None:
         """Nothing has been looked at yet.
 
         Args:
             rate: (state of the loop, t, ...) -> its rate, the cost last.
-            size: number of entries of the plant, of which the first ones of the state are.
             times: (K,) [s].
             step: longest one [s].
         """
@@ -102,7 +118,7 @@ class Pace:
         slope = ca.densify(ca.jacobian(rate(*symbols)[:dynamic], symbols[0])[:, :dynamic])
         self._slope = ca.Function("slope", symbols, [slope])
         self._rest = [np.zeros(rate.size1_in(i)) for i in range(2, rate.n_in())]
-        self._size, self._step = size, step
+        self._step = step
         self._all = self._left = max(MOST_STEPS, 2 * int(np.ceil(times[-1] / step)))
         self._end = float(times[-1])
         self.missed, self.rate = 0.0, 0.0
@@ -135,7 +151,7 @@ class Pace:
     def _fastest(self, state: Array, time: float) -> float:
         """Largest magnitude of an eigenvalue of the loop in some of the runs [1/s]; 0 where none has a value."""
         known = np.flatnonzero(np.isfinite(state).all(axis=0))
-        if not known.size or state.shape[0] < 2:
+        if not known.size:
             return 0.0
         chosen = known[np.unique(np.linspace(0, known.size - 1, LOOKED).astype(int))]
         with np.errstate(all="ignore"):

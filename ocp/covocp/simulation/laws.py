@@ -385,7 +385,7 @@ def _noisy(
         )
     runs = state.shape[1]
     steps = seeing_steps(control, state[:, 0], times, int(np.ceil(times[1] / step)))
-    pace = Pace(rate, loop.size, times, float(times[1]) / steps)
+    pace = Pace(rate, times, float(times[1]) / steps)
     sizes = [rate.size1_in(i) for i in range(4)]
     advance = vectorise(_function(held_noise_step(rate), [sizes[0], 2, *sizes[2:]]), padded(runs), (1,))
     controls = vectorise(control, padded(runs), (1,))
