@@ -191,17 +191,18 @@ def mention_saddle(curvature: float | None) -> None:
         )
 
 
-def stationarity_of(extremal: Extremal) -> float:
-    """The stationarity of an extremal that is no part of a chain, without the other conditions.
+def stationarity_of(extremal: Extremal, within: Within | None = None) -> float:
+    """The stationarity of an extremal, without the other conditions.
 
     Args:
-        extremal: with multipliers.
+        extremal: with multipliers, of a chain the completed ones.
+        within: what the rest of a chain says of it; None: it is alone.
     """
     if not extremal.statement.nu:
         return 0.0
     sizes = _at_nodes(extremal, discrete_costates(extremal)[0]).sizes
     scale = max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)
-    return _stationarity(extremal, _left(extremal), scale, None)
+    return _stationarity(extremal, _left(extremal), scale, within)
 
 
 def _left(extremal: Extremal) -> Array:

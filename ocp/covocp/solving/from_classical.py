@@ -7,7 +7,7 @@ expected cost, with its multipliers; where it is the one of a quadratic program 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +17,9 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
 from covocp.extremal.coarse_controls import are_steep
-from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls
+from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import COARSE_MESH, mesh_error
 from covocp.solving.attempts import counted, from_starts, with_stats
 from covocp.solving.warm_start import make_guesses
@@ -66,8 +67,10 @@ def from_classical(
     if failed.converged or reporter.stop or not statement.behind or statement.coupled:
         return failed, prepared
     found = classical()
-    around = None if found is None or reporter.stop else _around(statement, prepared.mesh, found, values)
-    if found is None or around is None:
+    if found is None or not found.converged or reporter.stop:
+        return failed, prepared
+    around = run_around(statement, prepared.mesh, found.extremal, values)
+    if around is None:
         return failed, prepared
     if (told := _as_optimum(around, found, strict=False)) is not None:
         return with_stats(told, **{**failed.stats, **found.stats, **counted(failed, found)}), prepared
@@ -92,18 +95,17 @@ def at_classical(
         values: of the parameters.
         strict: by the sums of the expected cost as exactly as a run would have it.
     """
-    if found is None or not mesh.eliminated:
+    if found is None or not found.converged or not mesh.eliminated:
         return None
-    around = _around(statement, mesh, found, values)
+    around = run_around(statement, mesh, found.extremal, values)
     told = None if around is None else _as_optimum(around, found, strict=strict)
     return None if told is None else with_stats(told, **found.stats)
 
 
-def _around(statement: Statement, mesh: Mesh, found: Outcome, values: Array) -> Outcome | None:
+def run_around(statement: Statement, mesh: Mesh, found: Extremal, values: Array) -> Outcome | None:
     """Filter and feedback around the nominal of the deterministic problem, on the mesh of the combined design."""
-    t = found.extremal.trajectory
-    alike = np.array_equal(found.extremal.mesh.nodes, mesh.nodes) and t.u.shape[0] == mesh.control_nodes
-    if not found.converged or not alike:
+    t = found.trajectory
+    if not np.array_equal(found.mesh.nodes, mesh.nodes) or t.u.shape[0] != mesh.control_nodes:
         return None
     around = evaluate_controls(statement, replace(mesh, eliminated=True), t.u, t.duration, values, t.x[0], held=t.x)
     return around if around.converged else None
@@ -112,12 +114,12 @@ def _around(statement: Statement, mesh: Mesh, found: Outcome, values: Array) -> 
 def _as_optimum(around: Outcome, found: Outcome, *, strict: bool) -> Outcome | None:
     """What runs around the nominal as the optimum of the expected cost, where it is stationary."""
     statement, mesh = around.extremal.statement, around.extremal.mesh
-    own = _multipliers(statement, mesh, found) if separates(statement) else None
+    own = shared_multipliers(statement, mesh, found.extremal) if separates(statement) else None
     if own is None:
         return None
     extremal = replace(around.extremal, multipliers=own)
     told = replace(around, extremal=extremal, message=found.message, violations=found.violations)
-    return told if _is_stationary(told, strict) else None
+    return told if is_stationary(extremal, told.cost_terms, strict=strict) else None
 
 
 def patiently(
@@ -132,32 +134,40 @@ def patiently(
     return with_stats(outcome, **counted(failed, outcome)), prepared
 
 
-def _is_stationary(outcome: Outcome, strict: bool) -> bool:
+def is_stationary(
+    extremal: Extremal, terms: Mapping[str, float], *, strict: bool, within: Within | None = None
+) -> bool:
     """Whether the expected cost is stationary there, too, up to what its steps leave: it is summed up otherwise.
 
     Where no run has come to an end the optimum of a quadratic program counts by its own sum. The cost is quadratic in
     what is left of the slope: above the least one by about the error of the mesh, where the slope is below its root.
     Where controls turn between two nodes both sums have little in common. Either is told.
+
+    Args:
+        extremal: around the nominal of the deterministic problem, with its multipliers.
+        terms: of its cost.
+        strict: as exactly as a run would have it.
+        within: what the rest of a chain says of it; None: it is alone.
     """
     from covocp.extremal.optimality import complementarity, stationarity_of  # which few solves need
 
-    extremal = outcome.extremal
-    error = mesh_error(extremal, outcome.cost_terms["running"])
+    error = mesh_error(extremal, terms["running"])
     left = max(LIMIT, min(error, COARSE_MESH))
     if strict:
         left = max(LIMIT, min(float(np.sqrt(error)), LITTLE))
-        return stationarity_of(extremal) <= left and complementarity(extremal) <= EXACT
+        others = 0.0 if within is None else within.size
+        return stationarity_of(extremal, within) <= left and complementarity(extremal, others) <= EXACT
     if impatient(extremal.statement):
         left = max(left, float(np.sqrt(error)), UNRESOLVED if are_steep(extremal) else 0.0)
-    return stationarity_of(extremal) <= left
+    return stationarity_of(extremal, within) <= left
 
 
-def _multipliers(statement: Statement, mesh: Mesh, found: Outcome) -> Multipliers | None:
+def shared_multipliers(statement: Statement, mesh: Mesh, found: Extremal) -> Multipliers | None:
     """The multipliers of the deterministic problem as those of the expected cost; None where they are of others.
 
     Those of each interval are the costates, and so are those of segments of several.
     """
-    own, other = Multipliers.zero(statement, mesh), found.extremal.multipliers
+    own, other = Multipliers.zero(statement, mesh), found.multipliers
     shared = {name: getattr(other, name) for name in SHARED}
     alike = all(np.shape(value) == np.shape(getattr(own, name)) for name, value in shared.items())
     if not alike or not mesh.eliminated or other.gaps.shape != (mesh.intervals, statement.nx):

@@ -23,6 +23,7 @@ from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
 from covocp.solving.failure import impossible_noises, with_stalled
 from covocp.solving.methods import METHODS, mesh_options, method_options
+from covocp.solving.phases_classical import without_noise
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
@@ -88,8 +89,10 @@ def solve_phases(
         asked = graded_for(best, asked)
         near = meeting_conditions(phases, best, parameters or {})
         starts = [list(near), list(best)] if near is not best else [list(best)]
+    classical = without_noise(phases, chain) if random is None and _may_be_had(method, asked[0], own) else None
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
-        outcome = ChainRuns(chain, method, prepare, own, reporter, values, starts).solve(asked, random)
+        runs = ChainRuns(chain, method, prepare, own, reporter, values, starts, classical)
+        outcome = runs.solve(asked, random)
         outcome = with_stalled(_if_possible(chain, outcome), reporter)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
@@ -113,6 +116,13 @@ def _preparing(method: str, module: str, nominal: str) -> Callable[..., Any]:
         )
     made_ready: Callable[..., Any] = prepare
     return made_ready
+
+
+def _may_be_had(method: str, options: Options, own: dict[str, Any]) -> bool:
+    """Whether an optimum may be had without a run: Ipopt's, of which no other digits or iterations are asked for."""
+    asked = "max_iterations" in own or own.get("tolerance") is not None
+    by_ipopt = method in (BEST, "auto") and own.get("plugin", BEST) == BEST
+    return by_ipopt and options.refine is None and not asked
 
 
 def _mention(phases: Phases, chain: Chain, asked: Sequence[Options], guesses: Sequence[Given]) -> None:

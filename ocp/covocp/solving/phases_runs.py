@@ -22,8 +22,10 @@ from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.solving.attempts import NO_MERIT, TRIED, best_of, counted, worth_a_run
 from covocp.solving.failure import with_stalled
+from covocp.solving.from_classical import SOON
 from covocp.solving.longer import longer, may_be_too_short
 from covocp.solving.other_minima import TURNS, unless_it_fails
+from covocp.solving.phases_classical import AroundClassical, around_classical
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
 from covocp.solving.refined_meshes import Measured, remade
@@ -76,14 +78,17 @@ class ChainRuns:
         reporter: Progress,
         values: Arrays,
         guesses: list[list[Any]],
+        classical: Chain | None = None,
     ) -> None:
         """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed.
 
-        Several guesses are tried one after the other, until the method finds its way.
+        Several guesses are tried one after the other, until the method finds its way. `classical`: the deterministic
+        problem where that has the optimum (`phases_classical`).
         """
         self._chain, self._method, self._prepare, self._own = chain, method, prepare, own
         self._reporter, self._values = reporter, values
         self._guesses, *self._others = guesses
+        self._classical, self._at_once = classical, False
 
     @property
     def statements(self) -> tuple[Statement, ...]:
@@ -167,7 +172,10 @@ class ChainRuns:
             guesses = tuple(Guess(trajectory=x.trajectory, warm=True) for x in extremals)
             try:
                 prepared = self._prepare(chain, finer, **self._own)
-                again = prepared.solve(tuple(x.parameters for x in extremals), guesses, self._reporter)
+                values = tuple(x.parameters for x in extremals)
+                around = self._around(chain, prepared, finer, values) if self._at_once else None
+                optimum = None if around is None else around.optimum(strict=False)
+                again = optimum or prepared.solve(values, guesses, self._reporter)
             except (CovocpError, RuntimeError):  # what the steps are off is told with the solution that there is
                 break
             if not again.converged:
@@ -183,8 +191,47 @@ class ChainRuns:
     def _from_starts(self, begun: Begun) -> Measured:
         """What `_found` is, without turns."""
         prepared = self._prepared(begun)
-        outcome = self._unwound(begun, prepared, self._found(begun, prepared))
+        around = self._around(begun.chain, prepared, begun.options, begun.values)
+        free = around is not None and all(guess is None for guess in self._guesses)
+        outcome = around.optimum(strict=True) if around is not None and free else None
+        self._at_once = outcome is not None
+        if outcome is None:
+            outcome = self._soon(begun, around) or self._unwound(begun, prepared, self._found(begun, prepared))
         return self._measured(begun.options, prepared, outcome)
+
+    def _around(
+        self, chain: Chain, prepared: Any, options: tuple[Options, ...], values: Arrays
+    ) -> AroundClassical | None:
+        """What runs around the deterministic problem's nominal on the meshes of the whole; None where a run must tell.
+
+        A run must where it is limited: that one knows no limits.
+        """
+        if self._classical is None or self._reporter.limited or self._reporter.stop:
+            return None
+        none: list[list[Any]] = [[None] * len(options)]
+        given = tuple(own[: st.np] for own, st in zip(values, self._classical.statements, strict=True))
+        try:
+            runs = ChainRuns(self._classical, self._method, self._prepare, self._own, self._reporter, given, none)
+            found = runs.cold(options, 0.0).outcome
+            assert isinstance(found, ChainOutcome)
+            return None if self._reporter.stop else around_classical(chain, prepared.meshes, values, found)
+        except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved
+            return None
+
+    def _soon(self, begun: Begun, around: AroundClassical | None) -> ChainOutcome | None:
+        """What a few iterations find where runs creep, or else the optimum as the deterministic problem has it.
+
+        None where that is none.
+        """
+        known = None if around is None else around.optimum(strict=False)
+        if known is None:
+            return None
+        hasty = self._prepare(begun.chain, begun.options, **{**self._own, "max_iterations": SOON})
+        outcome = self._unwound(begun, hasty, self._found(begun, hasty))
+        if outcome.converged or self._reporter.stop:
+            return outcome
+        self._at_once = True
+        return replace(known, stats={**outcome.stats, **known.stats, **counted(outcome, known)})
 
     def _found(self, begun: Begun, prepared: Any) -> ChainOutcome:
         """From the first start from which the method finds its way; from the first one where there is none.
