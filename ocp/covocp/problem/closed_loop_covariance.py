@@ -221,14 +221,17 @@ def free_gain(problem: Declarations) -> Gain | None:
 
 
 def with_best_gain(problem: Declarations, *, conditions: bool) -> Declarations | None:
-    """The problem without the terms of its cost that are not linear in X; None where nothing asks for a free gain.
+    """The problem with the best gain, without the terms of its cost that are not linear in X; None where it is that.
 
     Args:
         problem: with an expected cost.
-        conditions: whether E, the least that X can be, stands for X in its conditions; else they are left out.
+        conditions: whether E, the least that X can be, stands for X in its conditions; else they are left out, and
+            None is returned where there are none.
     """
-    if not reasons(problem):
+    if problem.expected is None or (problem.expected.gain is None and not reasons(problem)):
         return None
+    if not reasons(problem):
+        return replace(problem, expected=replace(problem.expected, gain=None)) if conditions else None
     plain, running, terminal = split_cost(problem)
     assert problem.expected is not None
     assert plain.expected is not None

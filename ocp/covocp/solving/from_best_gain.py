@@ -74,7 +74,14 @@ def from_best(
     lower = best.cost - BELOW * abs(best.cost)
     if not outcome.converged or sum(outcome.cost_terms.values()) < lower:
         return None
-    return outcome, start, kept and (own or _where(outcome, best))
+    same = _is_whole(statement, best) and (own or _where(outcome, best))
+    return outcome, start, kept and same
+
+
+def _is_whole(statement: Statement, best: Solution) -> bool:
+    """Whether all entries of the best gain are optimised: of a structure another one is the optimum."""
+    gain = free_gain_block(statement)
+    return gain is not None and best.loop is not None and gain.size == best.loop.gain[0].size
 
 
 def _where(outcome: Outcome, best: Solution) -> bool:
@@ -123,13 +130,13 @@ def _is_best(statement: Statement, mesh: Mesh, parameters: Array, best: Solution
     if gain is None or gain.kind == "state" or other is None or not other.behind or best.loop is None:
         return False
     assert statement.loop is not None
-    whole = statement.loop.spread is None and gain.size == best.loop.gain[0].size
+    linear = statement.loop.spread is None
     free = all(np.isinf(bound[gain.span]).all() for bound in statement.control_bounds)
     own = best.mesh
     alike = np.array_equal(own.nodes, mesh.nodes) and (own.control, own.instants) == (mesh.control, mesh.instants)
     alike = alike and (statement.state_names, statement.np) == (other.state_names, other.np)
     same = alike and np.array_equal(best.parameters, parameters)
-    return bool(best.converged and best.optimised and whole and free and same)
+    return bool(best.converged and best.optimised and linear and free and same)
 
 
 def _extremal(statement: Statement, mesh: Mesh, parameters: Array, guess: Guess) -> Extremal:
