@@ -74,6 +74,11 @@ def solve(problem, **options):
     return co.solve(problem, **{"progress": False, **options})
 
 
+def unassessed(problem, method="ipopt", *, guess=None, parameters=None, **options):
+    """A solution that is compared with another one: nothing is looked at after the run, which takes most of the time."""
+    return co.Solver(problem, method, **options).solve(parameters, guess=guess, progress=False, assess=False)
+
+
 def order(counts, errors):
     """Observed order of convergence: minus the slope of log error over log count."""
     return -linregress(np.log(counts), np.log(np.abs(errors))).slope

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.optimize import minimize_scalar
@@ -70,7 +72,7 @@ def test_least_energy_through_points_is_the_natural_spline(relative: bool) -> No
 
 def test_the_multiplier_of_a_point_is_the_difference_of_the_costs() -> None:
     h = 1e-3
-    costs = [co.solve(through(shift), intervals=10, **QUIET).cost for shift in (-h, h)]
+    costs = [unassessed(through(shift), intervals=10, tolerance=1e-10).cost for shift in (-h, h)]
     multiplier = co.solve(through(), intervals=10, **QUIET).multiplier("point 0")
     assert multiplier == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-8)
 
@@ -174,7 +176,7 @@ def variance_at(solution: co.Solution, time: float) -> float:
 def test_a_variance_is_below_its_limit_at_the_instant() -> None:
     """By scipy too; both formulations and both methods agree, and the multiplier is the difference of costs."""
     plain = co.solve(learning(0.05), intervals=40, **QUIET)
-    states = co.solve(learning(0.05), intervals=40, covariances="states", **MOVING, **QUIET)
+    states = unassessed(learning(0.05), intervals=40, covariances="states", tolerance=1e-10, **MOVING)
     assert variance_at(plain, 2.0) == pytest.approx(0.05, rel=3e-5)
     assert float(plain.at(2.0)["E"][2, 2]) == pytest.approx(0.05, abs=1e-7)
     assert states.cost == pytest.approx(plain.cost, rel=1e-10)
@@ -182,7 +184,7 @@ def test_a_variance_is_below_its_limit_at_the_instant() -> None:
     scale = np.abs(plain.costates.matrices).max()
     np.testing.assert_allclose(states.costates.matrices, plain.costates.matrices, atol=1e-7 * scale)
     h = 1e-4
-    costs = [co.solve(learning(0.05 + d), intervals=40, guess=plain, **QUIET).cost for d in (-h, h)]
+    costs = [unassessed(learning(0.05 + d), intervals=40, guess=plain, tolerance=1e-10).cost for d in (-h, h)]
     assert plain.multiplier("learnt") == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=2e-5)
     before, after = np.flatnonzero(plain.t == 2.0)
     jump = plain.costate("E")[before] - plain.costate("E")[after]
@@ -193,7 +195,7 @@ def test_a_variance_is_below_its_limit_at_the_instant() -> None:
     assert residuals.stationarity < 1e-7
     assert residuals.costate_difference < 1e-3
     assert residuals.hamiltonian_variation < 1e-5
-    gradient = co.solve(learning(0.05), "gradient", intervals=40, progress=False)
+    gradient = unassessed(learning(0.05), "gradient", intervals=40)
     assert gradient.cost == pytest.approx(plain.cost, rel=3e-5)
     assert gradient.multiplier("learnt") == pytest.approx(plain.multiplier("learnt"), rel=3e-5)
 
@@ -210,16 +212,21 @@ def test_a_reading_at_the_instant_counts_after_it(side: Any, form: str) -> None:
     assert found.optimality.stationarity < 1e-7
     assert found.optimality.costate_difference < 1e-4
     assert found.optimality.hamiltonian_variation < 1e-6
-    h, options = 1e-4, {"intervals": 30, "covariances": "eliminated", "guess": found, **QUIET}
-    costs = [co.solve(learning(0.05 + d, sampled=True, side=side), **options).cost for d in (-h, h)]
+    h, options = 1e-4, {"intervals": 30, "covariances": "eliminated", "guess": found, "tolerance": 1e-10}
+    costs = [unassessed(learning(0.05 + d, sampled=True, side=side), **options).cost for d in (-h, h)]
     assert found.multiplier("learnt") == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=2e-5)
 
 
 def test_a_condition_at_a_reading_is_about_what_is_known_after_it() -> None:
     """Where nothing else is said."""
-    own, after = (co.solve(learning(0.05, sampled=True, side=side), intervals=10, **QUIET) for side in (None, "after"))
+    own, after = (unassessed(learning(0.05, sampled=True, side=side), intervals=10) for side in (None, "after"))
     assert own.cost == after.cost
     assert own.multiplier("learnt") == after.multiplier("learnt")
+
+
+@cache
+def by_gauss_steps() -> co.Solution:
+    return unassessed(learning(0.05), intervals=60)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +234,7 @@ def test_a_condition_at_a_reading_is_about_what_is_known_after_it() -> None:
 )
 def test_every_step_passes_an_instant(options: dict[str, Any]) -> None:
     found = co.solve(learning(0.05), intervals=60, progress=False, **options)
-    gauss = co.solve(learning(0.05), intervals=60, progress=False)
+    gauss = by_gauss_steps()
     assert found.cost == pytest.approx(gauss.cost, rel=1e-3)
     assert found.multiplier("learnt") == pytest.approx(gauss.multiplier("learnt"), rel=1e-2)
     assert found.optimality.stationarity < 1e-6
@@ -236,9 +243,9 @@ def test_every_step_passes_an_instant(options: dict[str, Any]) -> None:
 
 def test_rows_that_nothing_needs_are_left_out_with_a_condition_too() -> None:
     """A lag that is known exactly: as with a variance of next to nothing; with less a run takes hundreds of steps."""
-    options = {"intervals": 40, **MOVING, **QUIET}
-    found = [co.solve(learning(0.1, actuator=0.0), covariances=form, **options) for form in FORMS]
-    kept = co.solve(learning(0.1, actuator=1e-10), **options)
+    options = {"intervals": 40, "tolerance": 1e-10, **MOVING}
+    found = [unassessed(learning(0.1, actuator=0.0), covariances=form, **options) for form in FORMS]
+    kept = unassessed(learning(0.1, actuator=1e-10), **options)
     for solution in found:
         assert solution.cost == pytest.approx(kept.cost, rel=1e-8)
         assert solution.multiplier("learnt") == pytest.approx(kept.multiplier("learnt"), rel=1e-6)
@@ -353,7 +360,8 @@ def test_a_share_of_a_free_duration_moves_with_it(moving: bool) -> None:
     found = co.solve(timed(co.Free(4.0, 0.5, 20.0), moving=moving), intervals=40, **QUIET)
     h = 0.02
     costs = [
-        co.solve(timed(found.duration + d, moving=moving), intervals=40, guess=found, **QUIET).cost for d in (-h, 0, h)
+        unassessed(timed(found.duration + d, moving=moving), intervals=40, guess=found, tolerance=1e-10).cost
+        for d in (-h, 0, h)
     ]
     least = h * (costs[0] - costs[2]) / (2.0 * (costs[0] - 2.0 * costs[1] + costs[2]))
     assert found.cost == pytest.approx(costs[1], rel=1e-10)
@@ -461,7 +469,7 @@ def steered(limit: float) -> co.Problem:
 
 
 def test_the_spread_of_the_closed_loop_at_an_instant() -> None:
-    free = co.solve(steered(9.0), intervals=20, progress=False)
+    free = unassessed(steered(9.0), intervals=20)
     k = int(np.flatnonzero(free.t == 1.0)[0])
     reached = float(free.covariance("x")[k].item())
     held = co.solve(steered(0.8 * reached), intervals=20, progress=False)
@@ -573,7 +581,7 @@ def test_the_certificate_says_that_it_does_not_know_them() -> None:
 )
 def test_the_reduced_method_meets_them(problem: Any) -> None:
     found = co.solve(problem(), intervals=30, **QUIET)
-    reduced = co.solve(problem(), "reduced", intervals=30, progress=False)
+    reduced = unassessed(problem(), "reduced", intervals=30)
     assert reduced.cost == pytest.approx(found.cost, rel=1e-6)
     np.testing.assert_allclose(reduced.multipliers.instants, found.multipliers.instants, rtol=2e-6)
 

@@ -9,7 +9,7 @@ import closed_loops
 import nonlinear_loop as loop
 import numpy as np
 import pytest
-from problems import graded, solve
+from problems import graded, solve, unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -99,7 +99,7 @@ def test_the_nominal_does_not_change_with_the_statistics():
         np.testing.assert_allclose(other.gains["C"], first.gains["C"], atol=1e-12)
     assert first.cost > 1.2 * others[0].cost
     # The classical nominal is the same too, but for another quadrature of the same cost.
-    plain = solve(linear_quadratic(), intervals=60, nominal="deterministic", tolerance=1e-9, substeps=2)
+    plain = unassessed(linear_quadratic(), intervals=60, nominal="deterministic", tolerance=1e-9, substeps=2)
     np.testing.assert_allclose(plain["u"], first["u"], atol=5e-6)
     np.testing.assert_allclose(plain.gains["C"], first.gains["C"], atol=1e-9)
 
@@ -119,7 +119,7 @@ COVARIANCES = ("eliminated", "states")
 @pytest.mark.parametrize(("covariances", "segments"), [("eliminated", 1), ("eliminated", 7), ("states", 7)])
 def test_formulations_agree_on_6_12(covariances, step, segments):
     """Same minimum within the error of the steps; the loop's own cost is had by its own steps."""
-    solution = solve(
+    solution = unassessed(
         unknown_lag.steering(), grid=GRADED, covariances=covariances, covariance_step=step, segments=segments
     )
     error = 2e-4 if step == "strang" else 5e-6
@@ -143,7 +143,9 @@ def test_constant_controls():
     assert solution.cost == pytest.approx(exact.cost, rel=1e-5)
     assert solution.loop.expected_cost == pytest.approx(exact.cost, rel=1e-5)
     assert STEERED < solution.cost < STEERED + 0.05
-    assert solve(unknown_lag.steering(), covariances="states", **options).cost == pytest.approx(exact.cost, rel=1e-5)
+    assert unassessed(unknown_lag.steering(), covariances="states", **options).cost == pytest.approx(
+        exact.cost, rel=1e-5
+    )
 
 
 @cache
@@ -202,13 +204,14 @@ def steered(limit=None, *, at="final", variance=1.0):
 @pytest.mark.parametrize("covariances", COVARIANCES)
 def test_condition_on_a_terminal_variance(covariances):
     """Met, dearer than without it, and its multiplier is the slope of the cost by the limit."""
-    free = solve(steered(), intervals=40)
+    free = unassessed(steered(), intervals=40)
     assert free["E"][-1, 1, 1] > 1.5
     solver = co.Solver(steered(1.2), intervals=40, covariances=covariances, tolerance=1e-9)
     found = solver.solve(progress=False)
     assert found["E"][-1, 1, 1] == pytest.approx(1.2, abs=1e-6)
     assert found.cost > free.cost + 0.1
-    costs = [solver.solve({"limit": 1.2 + d}, guess=found, progress=False).cost for d in (0.005, -0.005)]
+    nearby = ({"limit": 1.2 + d} for d in (0.005, -0.005))
+    costs = [solver.solve(limit, guess=found, progress=False, assess=False).cost for limit in nearby]
     assert (costs[1] - costs[0]) / 0.01 == pytest.approx(float(found.multiplier("condition")), rel=1e-3)
     assert found.optimality.cost_identity < 1e-4
     assert found.optimality.costate_difference < 1e-4
@@ -217,14 +220,15 @@ def test_condition_on_a_terminal_variance(covariances):
 @pytest.mark.filterwarnings("ignore:'condition' contains E")
 def test_condition_on_a_variance_along_the_path():
     """Matrices become states by themselves; the multipliers add up to the slope of the cost by the limit."""
-    free = solve(steered(variance=0.2), intervals=30)
+    free = unassessed(steered(variance=0.2), intervals=30)
     assert free["E"][:, 0, 0].max() > 0.58
     solver = co.Solver(steered(0.55, at="path", variance=0.2), intervals=30, tolerance=1e-9)
     found = solver.solve(progress=False)
     assert not found.mesh.eliminated
     assert found["E"][:, 0, 0].max() == pytest.approx(0.55, abs=1e-6)
     assert found.cost > free.cost
-    costs = [solver.solve({"limit": 0.55 + d}, guess=found, progress=False).cost for d in (0.002, -0.002)]
+    nearby = ({"limit": 0.55 + d} for d in (0.002, -0.002))
+    costs = [solver.solve(limit, guess=found, progress=False, assess=False).cost for limit in nearby]
     assert (costs[1] - costs[0]) / 0.004 == pytest.approx(float(found.multiplier("condition").sum()), rel=2e-3)
 
 
@@ -239,25 +243,21 @@ def bounded(upper=0.5):
     return ocp
 
 
-@cache
-def bounded_solution(covariances):
-    return solve(bounded(), intervals=12, covariances=covariances)
-
-
 def test_vector_state_with_bounds():
     """Both formulations, both bounds active; less than the classical design, which meets the same bounds."""
-    one, two = (bounded_solution(c) for c in COVARIANCES)
-    stated = solve(bounded(), intervals=12, covariances="states", covariance_step="gauss")
+    one = solve(bounded(), intervals=12, covariances="eliminated")
+    two = unassessed(bounded(), intervals=12, covariances="states")
+    stated = unassessed(bounded(), intervals=12, covariances="states", covariance_step="gauss")
     assert one.cost == pytest.approx(stated.cost, rel=1e-7)  # the same equations; by default other steps, of order 4
     for solution in (one, two, stated):
         assert solution["x"][:, 1].max() == pytest.approx(0.5, abs=2e-6)
         assert solution["u"].min() == pytest.approx(-0.5, abs=2e-6)
         np.testing.assert_allclose(solution["x"][-1], [1.0, 0.0], atol=1e-6)
         assert solution.optimality.stationarity < 1e-5
-    classical = solve(bounded(), intervals=12, nominal="deterministic")
+    classical = unassessed(bounded(), intervals=12, nominal="deterministic")
     assert one.stats["classical_cost"] == pytest.approx(classical.cost, rel=1e-6)
     assert one.cost < classical.cost - 1e-3
-    assert one.cost > solve(bounded(upper=5.0), intervals=12).cost
+    assert one.cost > unassessed(bounded(upper=5.0), intervals=12).cost
 
 
 # --- free duration ----------------------------------------------------------------------------------------------------
@@ -280,14 +280,14 @@ def test_free_duration(weight):
     """Case 1: k_T + tr(S_T X)/2 + H = 0; the cost of problems with T fixed is least there."""
     duration, options = co.Free(1.5, 0.5, 6.0), {"intervals": 30, "tolerance": 1e-9}
     free = solve(lasting(duration, weight), **options)
-    states = solve(lasting(duration, weight), covariances="states", covariance_step="gauss", **options)
+    states = unassessed(lasting(duration, weight), covariances="states", covariance_step="gauss", **options)
     assert states.cost == pytest.approx(free.cost, rel=1e-9)
     assert states.duration == pytest.approx(free.duration, rel=1e-6)
     for solution in (free, states):
         assert solution.optimality.transversality < 1e-6
         assert solution.optimality.hamiltonian_variation < 1e-5
     best, step = free.duration, 0.01
-    fixed = [solve(lasting(best + d, weight), **options).cost for d in (-step, 0.0, step)]
+    fixed = [unassessed(lasting(best + d, weight), **options).cost for d in (-step, 0.0, step)]
     assert free.cost == pytest.approx(fixed[1], rel=1e-8)
     slope, second = (fixed[2] - fixed[0]) / (2 * step), (fixed[2] - 2 * fixed[1] + fixed[0]) / step**2
     assert second > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -44,16 +46,25 @@ def cost_by_scipy(solution: co.Solution, start: float = -0.83) -> float:
     return float(WEIGHT * found.y[10, -1] + found.y[11, -1])
 
 
+@cache
+def of_free_duration(guess: float) -> co.Solution:
+    return co.solve(oscillator(co.Free(guess, 0.2, 60.0)), intervals=INTERVALS, progress=False)
+
+
+def cost_of(problem: co.Problem, intervals: int = INTERVALS) -> float:
+    """Of a fixed duration."""
+    return co.Solver(problem, intervals=intervals).solve(progress=False, assess=False).cost
+
+
 @pytest.fixture(scope="module")
 def least() -> float:
     """The least cost of all fixed durations, each solved by itself."""
-    durations = np.arange(2.0, 14.0, 0.5)
-    return min(co.solve(oscillator(float(T)), intervals=INTERVALS, progress=False).cost for T in durations)
+    return min(cost_of(oscillator(float(T))) for T in np.arange(2.0, 14.0, 0.5))
 
 
 @pytest.mark.parametrize("guess", [2.0, 3.0, 12.0, 30.0])
 def test_no_fixed_duration_is_cheaper(guess: float, least: float) -> None:
-    found = co.solve(oscillator(co.Free(guess, 0.2, 60.0)), intervals=INTERVALS, progress=False)
+    found = of_free_duration(guess)
     assert found.cost <= least * 1.001
     assert cost_by_scipy(found) == pytest.approx(found.cost, rel=1e-3)
 
@@ -67,7 +78,7 @@ def test_other_methods_are_led_there_too(method: str, least: float) -> None:
 
 def test_the_printout_says_what_was_left_and_limits_and_guesses_are_kept() -> None:
     solver = co.Solver(oscillator(co.Free(3.0, 0.2, 60.0)), intervals=INTERVALS)
-    found = solver.solve(progress=False)
+    found = of_free_duration(3.0)
     left = found.stats["left_duration"]
     assert left < found.duration
     assert f"a duration of {left:.3g} s" in " ".join(str(found).split())
@@ -82,10 +93,7 @@ def test_the_printout_says_what_was_left_and_limits_and_guesses_are_kept() -> No
 def test_limits_of_the_duration_are_kept() -> None:
     found = co.solve(oscillator(co.Free(3.0, 2.0, 4.5)), intervals=INTERVALS, progress=False)
     assert 2.0 - 1e-6 <= found.duration <= 4.5 + 1e-6
-    fixed = [
-        co.solve(oscillator(float(T)), intervals=INTERVALS, progress=False).cost for T in np.arange(2.0, 4.6, 0.25)
-    ]
-    assert found.cost <= min(fixed) * 1.001
+    assert found.cost <= min(cost_of(oscillator(float(T))) for T in np.arange(2.0, 4.6, 0.25)) * 1.001
 
 
 def vehicle(duration: float | co.Free) -> co.Problem:
@@ -106,7 +114,7 @@ def vehicle(duration: float | co.Free) -> co.Problem:
 
 def test_a_vehicle_does_not_stop_before_it_has_learnt() -> None:
     """From the second guess it ended after half a second, at 2.8 times the cost."""
-    fixed = min(co.solve(vehicle(T), intervals=INTERVALS, progress=False).cost for T in (3.0, 3.4, 3.8, 4.2))
+    fixed = min(cost_of(vehicle(T)) for T in (3.0, 3.4, 3.8, 4.2))
     for guess in (4.0, 10.0):
         found = co.solve(vehicle(co.Free(guess, 0.2, 60.0)), intervals=INTERVALS, progress=False)
         assert found.cost <= fixed * 1.001
@@ -125,10 +133,14 @@ def loop(duration: float | co.Free) -> co.Problem:
     return problem
 
 
+@pytest.fixture(scope="module")
+def costs_of_loops() -> list[float]:
+    return [cost_of(loop(T), 40) for T in (2.1, 2.2, 2.3, 2.4, 3.0, 5.0, 6.4, 6.8, 7.2, 9.0)]
+
+
 @pytest.mark.parametrize("guess", [2.5, 7.5, 10.0])
-def test_no_fixed_duration_of_a_loop_is_cheaper(guess: float) -> None:
-    durations = (2.1, 2.2, 2.3, 2.4, 3.0, 5.0, 6.4, 6.8, 7.2, 9.0)
-    costs = [co.solve(loop(T), intervals=40, progress=False).cost for T in durations]
+def test_no_fixed_duration_of_a_loop_is_cheaper(guess: float, costs_of_loops: list[float]) -> None:
+    costs = costs_of_loops
     assert costs[5] > 1.5 * max(costs[2], costs[7])  # between two minima
     assert co.solve(loop(co.Free(guess, 2.0, 22.0)), intervals=40, progress=False).cost <= min(costs)
 
@@ -137,6 +149,6 @@ def test_no_fixed_duration_of_a_loop_is_cheaper(guess: float) -> None:
 def test_many_starts_are_no_worse_than_none(starts: int) -> None:
     """They are tried beside what is found without them, other durations among that."""
     solver = co.Solver(oscillator(co.Free(3.0, 0.2, 60.0)), intervals=INTERVALS)
-    alone = solver.solve(progress=False)
+    alone = of_free_duration(3.0)
     many = solver.solve(guess="multistart", starts=starts, progress=False)
     assert many.cost <= alone.cost * (1.0 + 1e-7)

@@ -57,7 +57,7 @@ class Creeping:
 
 def solved_twice(duration, method, options, best):
     again = co.Solver(swung(duration), method, intervals=30, **options)
-    return Creeping(first=again.solve(progress=False), second=again.solve(progress=False), best=best)
+    return Creeping(first=again.solve(progress=False), second=again.solve(progress=False, assess=False), best=best)
 
 
 @cache

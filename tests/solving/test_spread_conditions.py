@@ -9,6 +9,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.stats import norm
 from spreads import TIME, double_integrator, ellipse, ellipse_by_duality, margin, wall
 
@@ -52,14 +53,14 @@ def test_wall_is_crossed_as_often_as_three_deviations_say():
 
 
 def test_wall_in_other_meshes():
-    costs = [co.solve(wall()[0], intervals=n, progress=False).cost for n in (33, 45)]
+    costs = [unassessed(wall()[0], intervals=n).cost for n in (33, 45)]
     assert np.ptp(costs) < 1e-3
 
 
 @pytest.mark.parametrize("limits", [(0.15, 0.05), (0.02, 0.05)])
 def test_terminal_ellipse_costs_what_duality_says(limits):
     fed, weights = ellipse_by_duality(limits)
-    solution = co.solve(ellipse(limits), intervals=80, progress=False)
+    solution = unassessed(ellipse(limits), intervals=80)
     assert solution.cost == pytest.approx(NOMINAL + fed, rel=2e-4)
     assert solution.cost >= (NOMINAL + fed) * (1 - 1e-5)
     final = np.diagonal(solution.covariance("x")[-1:], axis1=1, axis2=2)[0, 0]
@@ -69,7 +70,7 @@ def test_terminal_ellipse_costs_what_duality_says(limits):
 
 
 def test_terminal_ellipse_in_other_units():
-    costs = [co.solve(ellipse((0.03, 0.05), unit=unit), intervals=40, progress=False).cost for unit in (1.0, 1e-4)]
+    costs = [unassessed(ellipse((0.03, 0.05), unit=unit), intervals=40).cost for unit in (1.0, 1e-4)]
     assert costs[1] == pytest.approx(1e-8 * costs[0], rel=1e-5)
 
 
@@ -86,13 +87,13 @@ def test_margin_of_the_actuator_is_kept_in_simulation():
 
 
 def test_margin_that_leaves_the_feedback_nothing():
-    tight = [co.solve(margin(0.6, smallest=s), intervals=30, progress=False).cost for s in (1e-3, 1e-4)]
+    tight = [unassessed(margin(0.6, smallest=s), intervals=30).cost for s in (1e-3, 1e-4)]
     assert tight[0] == pytest.approx(tight[1], rel=1e-4)
 
 
 def test_condition_that_does_not_bind_leaves_the_best_gain():
     ocp, x, _ = double_integrator(miss=2.0)
-    best = co.solve(ocp, intervals=30, progress=False)
+    best = unassessed(ocp, intervals=30)
     X = ocp.closed_loop_covariance()
     ocp.subject_to(X[x, x], upper=10.0, name="loose")
     free = co.solve(ocp, intervals=30, progress=False)
@@ -104,7 +105,7 @@ def test_condition_that_does_not_bind_leaves_the_best_gain():
 
 def test_the_gradient_method_agrees():
     problem = ellipse((0.15, 0.2))
-    ipopt, gradient = (co.solve(problem, method, intervals=30, progress=False).cost for method in ("ipopt", "gradient"))
+    ipopt, gradient = (unassessed(problem, method, intervals=30).cost for method in ("ipopt", "gradient"))
     assert gradient == pytest.approx(ipopt, rel=1e-6)
 
 
@@ -115,7 +116,7 @@ def test_condition_with_a_parameter_is_that_with_its_number():
     ocp.subject_to(X[x, x] / limit, upper=1.0, at="final", name="end")
     solver = co.Solver(ocp, intervals=30)
     for value in (0.08, 0.03):
-        solution = solver.solve({"limit": value}, progress=False)
+        solution = solver.solve({"limit": value}, progress=False, assess=False)
         assert solution.covariance("x")[-1, 0, 0] == pytest.approx(value, rel=1e-4)
 
 
@@ -126,7 +127,7 @@ def test_constant_gain_meets_a_condition_and_costs_more_than_a_free_one():
         X = ocp.closed_loop_covariance()
         ocp = co.Problem.of(replace(ocp.declarations, expected=replace(ocp.expected, gain=gain)))
         ocp.subject_to(X[x, x] / 0.08, upper=1.0, at="final", name="end")
-        solution = co.solve(ocp, intervals=30, progress=False)
+        solution = unassessed(ocp, intervals=30)
         assert solution.covariance("x")[-1, 0, 0] <= 0.08 * (1 + 1e-4)
         costs.append(solution.cost)
     assert np.ptp(solution.gains["C"], axis=0).max() < 1e-9
@@ -137,7 +138,7 @@ def test_nominal_of_the_best_gain_is_evaluated_with_its_gain():
     """The gain is linear between the nodes there: what that changes is of second order in their distance."""
     missed = []
     for intervals in (20, 40):
-        best = co.solve(double_integrator(miss=1.0)[0], intervals=intervals, progress=False)
+        best = unassessed(double_integrator(miss=1.0)[0], intervals=intervals)
         ocp, x, _ = double_integrator(miss=1.0)
         X = ocp.closed_loop_covariance()
         ocp.subject_to(X[x, x] / 0.03, upper=1.0, at="final", name="end")
@@ -166,7 +167,7 @@ def test_linear_costs_of_the_spread_are_weights():
             running, terminal, weights = running + X[u, u] / 2, 1.5 * X[x, x], {"terminal_weight": {x: 0.0}}
         ocp.minimize_expected(running=running, terminal=terminal, **weights)
         assert ("the best one" in str(ocp)) is True
-        return co.solve(ocp, intervals=40, progress=False)
+        return unassessed(ocp, intervals=40)
 
     by_terms, by_weights = lag(True), lag(False)
     assert by_terms.cost == pytest.approx(by_weights.cost, rel=1e-9)
@@ -191,7 +192,7 @@ def test_nonlinear_cost_and_condition_are_two_sides_of_one_optimum():
     power = 0.3
     free = co.solve(nonlinear(None, power), intervals=60, progress=False)
     reached = float(free.covariance("x")[-1, 0, 0])
-    bound = co.solve(nonlinear(reached, power), intervals=60, progress=False)
+    bound = unassessed(nonlinear(reached, power), intervals=60)
     assert bound.multipliers.end[0] == pytest.approx(power / reached, rel=1e-3)
     assert free.cost_terms["covariances"] == pytest.approx(power * math.log(reached), rel=1e-6)
     assert free.cost - free.cost_terms["covariances"] == pytest.approx(bound.cost, rel=1e-5)

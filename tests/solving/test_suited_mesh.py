@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -45,7 +46,7 @@ def integrated(solution, rate):
 
 @cache
 def as_declared(method, rate):
-    return co.solve(actuator(rate), method, intervals=40, progress=False)
+    return unassessed(actuator(rate), method, intervals=40)
 
 
 # At 22 the explicit step of the declared rate is beyond its limit of stability (7.4 % off), at 200 far beyond.
@@ -101,14 +102,14 @@ def steered(rate=RATE, prior=0.1, density=0.05):
 def test_the_classical_design_beside_it_has_the_steps_of_these_values_too():
     solver = co.Solver(steered(), intervals=40)
     solution = solver.solve({"k": 22.0}, progress=False)
-    alone = co.solve(steered(22.0), intervals=40, nominal="deterministic", progress=False)
+    alone = unassessed(steered(22.0), intervals=40, nominal="deterministic")
     assert solution.stats["classical_cost"] == pytest.approx(alone.cost, rel=1e-9)
 
 
 @pytest.mark.parametrize("rate", [10.0, 16.0])
 def test_a_stable_plant_is_not_called_unstable_by_the_steps_of_two_runs(rate):
     solution = co.solve(steered(rate), intervals=40, nominal="deterministic", progress=False)
-    finer = co.solve(steered(rate), intervals=80, substeps=4, nominal="deterministic", progress=False)
+    finer = unassessed(steered(rate), intervals=80, substeps=4, nominal="deterministic")
     assert solution.cost == pytest.approx(finer.cost, rel=1e-5)
 
 
@@ -117,7 +118,7 @@ def test_a_stable_plant_is_not_called_unstable_by_the_steps_of_two_runs(rate):
 def test_a_default_mesh_is_graded_for_the_values_that_are_solved_for(name, value, options):
     declared = {"P": {"prior": value}, "R": {"density": value}}[name]
     solution = co.Solver(steered(), intervals=40, **options).solve({name: value}, progress=False)
-    other = co.solve(steered(**declared), intervals=40, progress=False, **options)
+    other = unassessed(steered(**declared), intervals=40, **options)
     assert solution.t.size == other.t.size > 41
     assert solution.cost == pytest.approx(other.cost, rel=1e-7)
 

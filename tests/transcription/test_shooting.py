@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, simulate, solve
+from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, simulate, solve, unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -25,7 +25,7 @@ FORMULATIONS = ("eliminated", "states")
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("step", ["gauss", "rk4"])
 def test_lag(final, weight, formulation, step):
-    solution = solve(lag(weight, final).problem, covariances=formulation, covariance_step=step)
+    solution = unassessed(lag(weight, final).problem, covariances=formulation, covariance_step=step)
     assert solution.mesh.eliminated == (formulation == "eliminated")
     assert solution.mesh.step == step
     assert solution.cost == pytest.approx(LAG_COSTS[final, weight], rel=1e-6)
@@ -38,12 +38,12 @@ def test_lag_with_strang(final):
     """Of order 2: extrapolated from two meshes to the cost, both formulations on the coarser one."""
     problem = lag(10.0, final).problem
     coarse, fine = (
-        solve(problem, covariance_step="strang", intervals=n, substeps=1, segments=10).cost for n in (100, 200)
+        unassessed(problem, covariance_step="strang", intervals=n, substeps=1, segments=10).cost for n in (100, 200)
     )
     exact = LAG_COSTS[final, 10.0]
     assert (fine - exact) / (coarse - exact) == pytest.approx(0.25, abs=0.02)
     assert (4 * fine - coarse) / 3 == pytest.approx(exact, rel=3e-6)
-    other = solve(problem, covariance_step="strang", intervals=100, substeps=1, covariances="states").cost
+    other = unassessed(problem, covariance_step="strang", intervals=100, substeps=1, covariances="states").cost
     assert other == pytest.approx(coarse, rel=1e-7)
 
 
@@ -74,7 +74,7 @@ def test_the_better_of_two_minima(formulation, final):
 def test_order_of_the_cost(control, expected, final):
     """Against the published cost; its nine digits bear the errors of up to 80 intervals."""
     problem, counts = lag(10.0, final).problem, [25, 50, 80]
-    costs = [solve(problem, intervals=n, substeps=1, control=control, tolerance=1e-9).cost for n in counts]
+    costs = [unassessed(problem, intervals=n, substeps=1, control=control, tolerance=1e-9).cost for n in counts]
     assert order(counts, np.array(costs) - LAG_COSTS[final, 10.0]) == pytest.approx(expected, abs=0.35)
 
 
@@ -83,7 +83,7 @@ def test_order_of_the_cost_of_the_noisy_integrator(control, expected):
     """u = 2/3 + t - t^2/2 exactly, J = 59/90 [3.4 b]."""
     counts = [5, 10, 20]
     problem = noisy_integrator.problem(0.0, 1.0)
-    errors = [solve(problem, intervals=n, control=control, tolerance=1e-11).cost - 59 / 90 for n in counts]
+    errors = [unassessed(problem, intervals=n, control=control, tolerance=1e-11).cost - 59 / 90 for n in counts]
     assert order(counts, errors) == pytest.approx(expected, abs=0.2)
 
 
@@ -144,7 +144,7 @@ def test_chain(masses, options):
         if published is None:
             continue
         mesh = {"intervals": 50, "control": "constant", "substeps": 1, "covariance_step": step}
-        solution = solve(problem, **{"covariances": "eliminated", "tolerance": 1e-9, **mesh, **options})
+        solution = unassessed(problem, **{"covariances": "eliminated", "tolerance": 1e-9, **mesh, **options})
         assert solution.cost == pytest.approx(published, rel=1e-8)
         assert np.linalg.eigvalsh(solution["E"]).min() > 0
 
@@ -194,7 +194,7 @@ def test_path_inequality_on_a_variance():
         data = lag(1.0, 1.0)
         excess = data.E[data.b, data.b] - bound(data.problem.time, ca.exp)
         data.problem.subject_to(excess, name="learn early")
-        solutions[formulation] = solve(data.problem, covariances=formulation, intervals=50)
+        solutions[formulation] = unassessed(data.problem, covariances=formulation, intervals=50)
     assert not solutions["auto"].mesh.eliminated
     assert solutions["states"].cost == pytest.approx(solutions["eliminated"].cost, rel=1e-6)
     free, solution = solve(lag(1.0, 1.0).problem), solutions["states"]
@@ -390,7 +390,9 @@ def test_unstable_nominal(segments):
     """Errors of the start grow by exp(30) on the way; p(0) = dJ/dx0 must not feel that, whatever the segments."""
     solver = co.Solver(unstable(), segments=segments)
     solution = solver.solve(progress=False)
-    above, below = (solver.solve({"start": v}, guess=solution, progress=False).cost for v in (1.001, 0.999))
+    above, below = (
+        solver.solve({"start": v}, guess=solution, progress=False, assess=False).cost for v in (1.001, 0.999)
+    )
     assert solution.costate("x")[0] == pytest.approx((above - below) / 0.002, rel=1e-4)
     assert solution.optimality.stationarity < 1e-5
     assert solution.optimality.hamiltonian_variation < 1e-3
