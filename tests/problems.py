@@ -75,7 +75,7 @@ def solve(problem, **options):
 
 
 def unassessed(problem, method="ipopt", *, guess=None, parameters=None, **options):
-    """A solution that is compared with another one: nothing is looked at after the run, which takes most of the time."""
+    """A solution that is compared with another one: nothing is looked at after the run, to save time."""
     return co.Solver(problem, method, **options).solve(parameters, guess=guess, progress=False, assess=False)
 
 

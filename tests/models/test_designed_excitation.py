@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.integrate import quad_vec
 
 import covocp as co
@@ -30,6 +31,11 @@ def within():
 @pytest.fixture(scope="module")
 def paths(designed, within):
     return {"circle": model.classical(), "designed": model.path(designed), "within": model.path(within)}
+
+
+@pytest.fixture(scope="module")
+def flown(paths):
+    return {name: model.fly(path, runs=RUNS, seed=1) for name, path in paths.items()}
 
 
 def by_quadrature(position, duration, variances, noise, radius):
@@ -101,16 +107,17 @@ def test_paths_that_may_end_anywhere_are_better_still(designed, within):
 
 def test_other_starts_find_the_same(designed):
     """Random starts end in the minimum of the default guess."""
-    costs = [co.solve(model.problem(), guess=model.start(2, seed), **SMALL).cost for seed in (5, 12)]
-    same = co.solve(model.problem(), **SMALL).cost
+    mesh = {"intervals": 40, "substeps": 2}
+    costs = [unassessed(model.problem(), guess=model.start(2, seed), **mesh).cost for seed in (5, 12)]
+    same = unassessed(model.problem(), **mesh).cost
     np.testing.assert_allclose(costs, same, rtol=1e-4)
     assert same == pytest.approx(designed.cost, rel=1e-2)
 
 
 @pytest.mark.parametrize("name", ["circle", "designed", "within"])
-def test_filters_find_what_is_predicted(paths, name):
+def test_filters_find_what_is_predicted(flown, name):
     """4000 functions from the prior: measured mean squares against what the filter says, in 4 standard errors."""
-    flights = model.fly(paths[name], runs=RUNS, seed=1)
+    flights = flown[name]
     mean, error = flights.measured("once")
     assert abs(mean - np.trace(flights.once_covariance)) < 4 * error
     normalised = np.einsum("ri,ij,rj->r", flights.once, np.linalg.inv(flights.once_covariance), flights.once)
@@ -122,9 +129,9 @@ def test_filters_find_what_is_predicted(paths, name):
     assert f"predicted {np.trace(flights.once_covariance):.3f}" in str(flights)
 
 
-def test_the_gain_is_there_in_the_filter(paths):
+def test_the_gain_is_there_in_the_filter(flown):
     """Measured errors are a fifth smaller than the circle's, beyond three standard errors of both."""
-    circle, _, within = (model.fly(path, runs=RUNS, seed=1).measured() for path in paths.values())
+    circle, _, within = (flights.measured() for flights in flown.values())
     assert within[0] + 3 * within[1] < 0.8 * (circle[0] - 3 * circle[1])
 
 

@@ -20,8 +20,13 @@ def integrated(solution: co.Solution, prior: float, noise: float = NOISE) -> flo
     return cost_along(solution.t, solution["u"].ravel(), prior * np.eye(2), noise)
 
 
-@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
-@pytest.mark.parametrize("prior", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize(
+    ("method", "prior"),
+    [
+        *((method, prior) for method in ("ipopt", "reduced") for prior in (1.0, 1e3, 1e6)),
+        *(("gradient", prior) for prior in (1.0, 1e6)),
+    ],
+)
 def test_a_larger_prior_in_a_loop_has_its_own_cost(method, prior):
     solver = co.Solver(moved(), method, intervals=12)
     solver.solve(progress=False)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from problems import unassessed
 
 import covocp as co
 from covocp.solving import gain_ways, other_ways, solver
@@ -37,7 +38,7 @@ def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
     options = {"intervals": 30, "progress": False}
     with pytest.raises(co.SolveError, match="largest number of iterations"):
         co.solve(brisk(), max_iterations=12, **options)  # as asked: nothing is tried beyond
-    alone = co.solve(brisk(), **options)
+    alone = unassessed(brisk(), intervals=30)
     monkeypatch.setattr(solver, "PATIENCE", 12)
     found = co.solve(brisk(), **options)
     assert found.cost == pytest.approx(alone.cost, rel=1e-6)
@@ -68,8 +69,8 @@ def test_a_step_that_raises_leaves_the_run_that_failed(monkeypatch):
 def test_other_plugins_and_methods_keep_their_own_iterations():
     """Sequential quadratic programming has no such option; it finds the same limits kept."""
     problem = brisk(1.4)  # which do not bind
-    by_other = co.solve(problem, intervals=10, plugin="sqpmethod", progress=False)
-    assert by_other.cost == pytest.approx(co.solve(problem, intervals=10, progress=False).cost, rel=1e-6)
+    by_other = unassessed(problem, intervals=10, plugin="sqpmethod")
+    assert by_other.cost == pytest.approx(unassessed(problem, intervals=10).cost, rel=1e-6)
 
 
 def test_at_a_limit_inside_a_loosened_run_the_best_point_counts(monkeypatch):
