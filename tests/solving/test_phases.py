@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from phased import DRAG, RESTITUTION, bounce, lag, steered
+from problems import unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -186,7 +187,7 @@ def test_costates_of_the_first_covariance_are_slopes_of_the_cost_of_all_phases()
     """Through the filter, the jump, and the filter of the next phase: against differences of solved problems."""
     step, options = 1e-3, {"intervals": 20, "tolerance": 1e-10, "covariances": "states", **QUIET}
     costs = [co.solve(bounce(0.5 + side * step), **options).cost for side in (1.0, -1.0)]
-    slope = co.solve(bounce(), **{**options, "covariances": "eliminated"})["fall"].costate("E")[0][1, 1]
+    slope = bounced_by("eliminated")["fall"].costate("E")[0][1, 1]
     assert slope == pytest.approx((costs[0] - costs[1]) / (2.0 * step), rel=1e-5)
 
 
@@ -255,7 +256,7 @@ def test_an_unstable_plant_in_three_phases_costs_what_it_costs_in_one() -> None:
         ocp.minimize(running=u**2 + x**2 + E[x, x])
         return ocp
 
-    whole = co.solve(part("whole", 3.0, first=True, last=True), grid=np.linspace(0, 1, 61), **QUIET)
+    whole = unassessed(part("whole", 3.0, first=True, last=True), grid=np.linspace(0, 1, 61))
     pieces = [part("a", 1.0, first=True, last=False), part("b", 1.0, first=False, last=False)]
     cut = co.solve(co.Phases([*pieces, part("c", 1.0, first=False, last=True)]), grid=np.linspace(0, 1, 21), **QUIET)
     assert cut.cost == pytest.approx(whole.cost, rel=1e-6)
@@ -263,9 +264,8 @@ def test_an_unstable_plant_in_three_phases_costs_what_it_costs_in_one() -> None:
 
 def test_a_warm_start_needs_few_iterations() -> None:
     for form in FORMS:
-        options = {"intervals": 20, "covariances": form, **QUIET}
-        cold = co.solve(bounce(), **options)
-        warm = co.solve(bounce(), guess=cold, **options)
+        cold = bounced_by(form)
+        warm = co.solve(bounce(), intervals=20, covariances=form, guess=cold, **QUIET)
         assert warm.cost == pytest.approx(cold.cost, rel=1e-7)
         assert warm.stats["iterations"] <= 2
 
