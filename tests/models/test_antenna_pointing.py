@@ -164,10 +164,11 @@ def test_zones_that_are_never_met_are_not_called_kept():
     ],
 )
 def test_printed_settings_fail(settings, shares):
-    """With the low-pass none arrives but by chance (one of 128); without it some."""
-    allowed = 0.02 if settings == "printed" else 0.08
+    """With the low-pass none arrives but by chance (at most one of 64); without it some."""
+    allowed, runs = (0.02, 64) if settings == "printed" else (0.08, 128)
     for name, share in shares.items():
-        assert antenna_pointing.simulate(name, settings=settings).success == pytest.approx(share, abs=allowed)
+        success = antenna_pointing.simulate(name, settings=settings, runs=runs).success
+        assert success == pytest.approx(share, abs=allowed)
 
 
 @pytest.mark.parametrize(("azimuth", "power"), [("source", 2.5646067), ("literal", 2.2278494)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from problems import order, solve
+from problems import order, solve, unassessed
 from refusals import refused
 from scipy.integrate import solve_ivp
 
@@ -158,10 +158,10 @@ def test_budget_of_variances(way):
     assert float(solution["spread"]) == pytest.approx(3.5, rel=1e-5)
     assert solution.optimality.costate_difference < 1e-3
     if way == WAYS[0]:
-        more, less = (solve(watched(budget=3.5 + d), intervals=40).cost for d in (1e-3, -1e-3))
+        more, less = (unassessed(watched(budget=3.5 + d), intervals=40).cost for d in (1e-3, -1e-3))
         assert solution.multiplier("budget") == pytest.approx((less - more) / 2e-3, rel=2e-4)
     else:
-        reference = solve(watched(budget=3.5), intervals=40, **WAYS[0])
+        reference = unassessed(watched(budget=3.5), intervals=40, **WAYS[0])
         assert solution.cost == pytest.approx(reference.cost, rel=5e-6 if way.get("method") else 1e-7)
 
 
@@ -180,7 +180,7 @@ def test_integral_in_a_closed_loop(way):
     solution = solve(ocp, intervals=30, **way)
     assert float(solution["total"]) == pytest.approx(0.41, rel=1e-5)
     if "method" in way:
-        assert solution.cost == pytest.approx(solve(ocp, intervals=30).cost, rel=5e-6)
+        assert solution.cost == pytest.approx(unassessed(ocp, intervals=30).cost, rel=5e-6)
     assert solution.optimality.cost_identity < 1e-5
     assert solution.optimality.costate_difference < 2e-3
     weights = np.trapezoid(solution["E"][:, 0, 0], solution.t)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -60,10 +63,15 @@ def cost_of_cart_and_pole(duration):
     return cost_of(drift, input_, weights, np.eye(1) / 10, noise, seen, first, end, start, duration)
 
 
+@cache
+def classical(duration):
+    return co.solve(cart_and_pole(duration), nominal="deterministic", progress=False)
+
+
 @pytest.mark.parametrize("duration", [3.0, 5.0, 10.0])
 def test_the_classical_design_of_an_unstable_plant_keeps_to_its_nominal(duration):
     """Filter and loop need shorter steps; by these the same controls led to an angle of 1305, at a cost of 2.8e7."""
-    solution = co.solve(cart_and_pole(duration), nominal="deterministic", progress=False)
+    solution = classical(duration)
     assert solution.cost == pytest.approx(cost_of_cart_and_pole(duration), rel=1e-4)  # control is linear
     assert solution.mesh_error < 1e-4
     again = co.evaluate(cart_and_pole(duration), nominal=solution)
@@ -80,7 +88,7 @@ def test_worth_looks_along_no_controls_that_lead_elsewhere():
 
 def test_a_control_that_is_given_runs_as_it_is():
     """Only a solution of the same system has states that are meant: from elsewhere its controls lead elsewhere."""
-    solution = co.solve(cart_and_pole(5.0), nominal="deterministic", progress=False)
+    solution = classical(5.0)
     other = co.evaluate(cart_and_pole(5.0, drag=0.3), nominal=solution)
     assert abs(other["angle"][-1]) > 1.0
 
@@ -139,7 +147,7 @@ def test_a_stable_plant_is_not_held_at_the_nodes_of_long_steps():
     ocp.dynamics(x, ca.vertcat(-0.1 * x[0] + 3 * x[1], -3 * x[0] - 0.1 * x[1] + u), noise=[0.0, 0.1])
     ocp.measurement("y", x[0], noise=0.1)
     ocp.minimize_expected(running=ca.sumsqr(x) + u**2, terminal=ca.sumsqr(x))
-    fine = co.solve(ocp, nominal="deterministic", intervals=20, substeps=32, progress=False)
+    fine = unassessed(ocp, nominal="deterministic", intervals=20, substeps=32)
     with pytest.warns(co.CovocpWarning, match="too coarse"):
         classical = co.solve(ocp, nominal="deterministic", intervals=20, substeps=8, progress=False)
     found = co.evaluate(ocp, nominal=classical, intervals=20)

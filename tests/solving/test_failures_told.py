@@ -40,7 +40,7 @@ def said(ocp: co.Problem, **options: Any) -> str:
 @pytest.mark.parametrize("options", [{}, {"hessian": "exact"}, {"hessian": "limited-memory"}])
 def test_a_kink_in_a_control_is_told_and_no_way_that_was_given(options):
     """method='reduced' or hessian='exact' had been recommended to who had given the latter."""
-    words = said(mass(ca.fabs), intervals=20, **options)
+    words = said(mass(ca.fabs), intervals=10, **options)
     assert "kinks or jumps in 'u' (abs)" in words
     assert "method='reduced'" not in words
     exact = options.get("hessian") != "limited-memory"  # that of plain problems is exact

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
+from problems import unassessed
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -49,6 +52,11 @@ def expected(duration: float) -> float:
     s = solve_ivp(steered, (duration, 0.0), np.append(END.ravel(), 0.0), **known).y[:, -1]
     S = s[:4].reshape(2, 2)
     return float(0.5 * START @ S @ START + 0.5 * np.trace(S @ PRIOR) + s[4])
+
+
+@cache
+def solved(duration: float) -> co.Solution:
+    return co.solve(mass(duration), progress=False)
 
 
 @pytest.mark.parametrize("duration", [0.1, 5.0, 50.0])
@@ -99,7 +107,7 @@ def test_ctrl_c_in_the_deterministic_problem_carries_an_iterate(monkeypatch: pyt
 
 
 def test_what_is_asked_for_otherwise_finds_the_same():
-    at_once = co.solve(mass(5.0), progress=False)
+    at_once = solved(5.0)
     for options in ({"max_iterations": 500}, {"covariances": "states"}, {"guess": at_once}, {"guess": {"u": 1.0}}):
         found = co.solve(mass(5.0), progress=False, **options)
         step = 2e-6 if "covariances" in options else 1e-7
@@ -107,13 +115,13 @@ def test_what_is_asked_for_otherwise_finds_the_same():
         assert found.mesh.eliminated == ("covariances" not in options)
         np.testing.assert_allclose(found["u"], at_once["u"], atol=2e-3 * np.ptp(at_once["u"]))
     for method in ("auto", "reduced", "gradient"):
-        assert co.solve(mass(5.0), method, progress=False).cost == pytest.approx(at_once.cost, rel=1e-6)
+        assert unassessed(mass(5.0), method).cost == pytest.approx(at_once.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize("bound", [0.05, 0.1, 0.4])
 def test_bounds_of_the_control_and_their_multipliers(bound):
     limited = co.solve(mass(5.0, lower=-bound, upper=bound), progress=False)
-    other = co.solve(mass(5.0, lower=-bound, upper=bound), max_iterations=1000, progress=False)
+    other = unassessed(mass(5.0, lower=-bound, upper=bound), max_iterations=1000)
     assert limited.cost == pytest.approx(other.cost, rel=1e-7)
     assert limited.optimality.stationarity < 1e-4
     assert limited.optimality.complementarity < 2e-7
@@ -123,7 +131,7 @@ def test_bounds_of_the_control_and_their_multipliers(bound):
 
 def test_a_limit_of_the_spread_is_no_quadratic_program():
     """Whose deterministic optimum leaves it: the run must find what keeps to it."""
-    free = co.solve(mass(5.0), progress=False)
+    free = solved(5.0)
     fast = free.trajectory.x[:, 1] + 3.0 * np.sqrt(free.loop.X[:, 1, 1])
     limit = 0.95 * float(fast.max())
     held = co.solve(mass(5.0, limit), progress=False)
@@ -134,7 +142,7 @@ def test_a_limit_of_the_spread_is_no_quadratic_program():
 
 def test_what_is_not_stationary_is_not_taken(monkeypatch: pytest.MonkeyPatch):
     """A nominal that would be wrongly called the optimum is left to the run, which finds it."""
-    right = co.solve(mass(5.0), progress=False)
+    right = solved(5.0)
     original = from_classical._around
 
     def pushed(statement, mesh, found, values):
