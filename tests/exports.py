@@ -135,6 +135,12 @@ def package(name: str) -> CPackage:
     return made
 
 
+def quick(made: CPackage) -> CPackage:
+    """A package, compiled at once as what flies it or compares it needs, not as `python` and `check` would."""
+    made.build(flags=QUICK)
+    return made
+
+
 @lru_cache
 def sanitized(name: str) -> tuple[Path, ...]:
     """Object code of a package under the sanitizers; none where the compiler has no sanitizers."""

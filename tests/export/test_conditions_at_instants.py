@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from exports import quick
+
 import covocp as co
 
 
@@ -22,12 +24,12 @@ def swift() -> co.Problem:
 
 def test_a_trajectory_jumps_at_the_instant(tmp_path: Any) -> None:
     solution = co.solve(swift(), intervals=10, progress=False)
-    package = co.export_c(solution, tmp_path / "swift")
+    package = quick(co.export_c(solution, tmp_path / "swift"))
     assert package.check().ok
     before, after = (float(solution.at(1.2, side)["u"]) for side in ("before", "after"))
     assert abs(after - before) > 0.1
 
 
 def test_a_solver_meets_it_from_other_starts(tmp_path: Any) -> None:
-    package = co.export_c(swift(), tmp_path / "solver", intervals=10)
+    package = quick(co.export_c(swift(), tmp_path / "solver", intervals=10))
     assert package.check(samples=5).ok

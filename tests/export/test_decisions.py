@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from exports import quick
 
 import covocp as co
 from covocp.export import export_c
@@ -62,7 +63,7 @@ def test_a_controller_flies_what_was_chosen(tmp_path):
         return ocp
 
     solution = co.solve(loop(), intervals=10, progress=False)
-    package = export_c(solution, tmp_path / "chosen")
+    package = quick(export_c(solution, tmp_path / "chosen"))
     plain = export_c(co.evaluate(loop(float(solution["r"])), nominal=solution), tmp_path / "plain")
     controllers = [package.python(), plain.reference()]
     for laws in controllers:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from exports import QUICK
 from limited_speed import cost_along, limited_speed
+from optima import optimum
 
 import covocp as co
 
@@ -56,11 +57,9 @@ def test_an_error_that_dies_out_at_once_is_borne(tmp_path):
     ocp.measurement("m", v, noise=0.01)
     E = ocp.estimation_covariance()
     ocp.minimize(running=0.1 * u**2 + E[v, v])
-    package = co.export_c(ocp, tmp_path / "p", name="wind", intervals=20)
-    package.build(flags=QUICK)
-    declared = package.python().solve()
+    declared = co.export_c(ocp, tmp_path / "p", name="wind", intervals=20).reference().solve()
     assert declared["status"] == "OK"
-    assert declared["cost"] == pytest.approx(co.solve(ocp, intervals=200, progress=False).cost, rel=0.01)
+    assert declared["cost"] == pytest.approx(optimum(ocp, intervals=200).cost, rel=0.01)
 
 
 def test_the_package_says_what_it_means(package):
@@ -71,9 +70,8 @@ def test_the_package_says_what_it_means(package):
 
 
 def test_a_cost_that_does_not_see_the_way_bears_any_prior(tmp_path):
-    package = co.export_c(limited_speed(running=False), tmp_path / "p", name="final", intervals=20)
-    package.build(flags=QUICK)
-    assert package.python().solve(initial_E=1e6 * np.eye(2))["status"] == "OK"
+    planner = co.export_c(limited_speed(running=False), tmp_path / "p", name="final", intervals=20).reference()
+    assert planner.solve(initial_E=1e6 * np.eye(2))["status"] == "OK"
 
 
 @pytest.mark.parametrize(("speed", "status"), [(1.0, "OK"), (1.0 + 1e-9, "OK"), (1.2, "NOT_CONVERGED")])

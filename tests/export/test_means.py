@@ -9,7 +9,7 @@ import casadi as ca
 import means
 import numpy as np
 import pytest
-from exports import FOLDER
+from exports import FOLDER, quick
 
 import covocp as co
 from covocp.export import export_c
@@ -133,6 +133,6 @@ def test_with_a_period_the_mean_of_the_loop_is_what_is_said_of_it() -> None:
 def test_a_flown_law_has_no_bias(period: float | None) -> None:
     """At the end it was half a step of its way, eight standard deviations, too far."""
     solution = mass()
-    law = export_c(solution, FOLDER / f"mass_{period}", period=period, largest_spread=np.inf).python()
+    law = quick(export_c(solution, FOLDER / f"mass_{period}", period=period, largest_spread=np.inf)).python()
     sample = co.simulate(solution, 200, seed=1, law=law, period=0.1, progress=False)
     assert abs(sample.deviations[:, 0].mean()) < 4 * sample.deviations[:, 0].std() / np.sqrt(200)

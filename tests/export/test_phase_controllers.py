@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import phased_loops
 import pytest
-from exports import FOLDER, QUICK
+from exports import FOLDER, QUICK, quick
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
@@ -187,7 +187,7 @@ def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> No
 def test_a_step_where_phases_meet_takes_the_reading_of_the_one_that_ends() -> None:
     """It gives out the control of the one that begins, C(0) of its own; the same time again changes nothing."""
     fall, rise = bounced()
-    laws = package().python(), co.export_c(fall, FOLDER / "fall").python()
+    laws = package().python(), quick(co.export_c(fall, FOLDER / "fall")).python()
     for k in range(1, 21):
         time = k / 20.0
         reading = float(fall.at(time)["x"]) + 0.2 * np.cos(9 * time)

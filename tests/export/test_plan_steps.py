@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from exports import quick
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -38,7 +39,7 @@ def place_and_cost(plan: dict[str, Any], speed: float, k: float) -> tuple[float,
 
 @pytest.fixture(scope="module")
 def drag_solver(tmp_path_factory):
-    return co.export_c(drag(), tmp_path_factory.mktemp("drag") / "drag", intervals=20).python()
+    return quick(co.export_c(drag(), tmp_path_factory.mktemp("drag") / "drag", intervals=20)).python()
 
 
 @pytest.mark.parametrize(("speed", "k"), [(1.0, 0.5), (0.5, 0.5), (2.0, 0.5), (3.0, 0.5), (1.0, 1.0)])
@@ -61,7 +62,7 @@ def test_a_plan_for_a_plant_that_is_none_is_not_ok(drag_solver, speed: float, k:
 
 
 def test_shorter_steps_bear_it(tmp_path) -> None:
-    made = co.export_c(drag(), tmp_path / "drag", intervals=20, substeps=8).python()
+    made = co.export_c(drag(), tmp_path / "drag", intervals=20, substeps=8).reference()
     plan = made.solve(initial_v=10.0)
     assert plan["status"] == "OK"
     assert place_and_cost(plan, 10.0, 0.5)[0] == pytest.approx(6.0, rel=1e-3)
@@ -72,13 +73,14 @@ def test_what_was_told_at_the_export_is_not_told_again(tmp_path) -> None:
     with pytest.warns(co.CovocpWarning):
         co.solve(unknown_lag.problem(weight=1000.0), intervals=5, substeps=1, progress=False)
     with pytest.warns(co.CovocpWarning):
-        made = co.export_c(unknown_lag.problem(weight=1000.0), tmp_path / "lag", intervals=5, substeps=1).python()
-    assert made.solve()["status"] == "OK"
+        made = co.export_c(unknown_lag.problem(weight=1000.0), tmp_path / "lag", intervals=5, substeps=1)
+    assert made.reference().solve()["status"] == "OK"
 
 
 @pytest.fixture(scope="module")
 def lag_solver(tmp_path_factory):
-    return co.export_c(unknown_lag.problem(weight=10.0), tmp_path_factory.mktemp("lag") / "lag", intervals=20).python()
+    made = co.export_c(unknown_lag.problem(weight=10.0), tmp_path_factory.mktemp("lag") / "lag", intervals=20)
+    return made.reference()
 
 
 @pytest.mark.parametrize(("given", "status"), [({}, "OK"), ({"b": 5.0}, "COARSE"), ({"duration": 60.0}, "COARSE")])

@@ -6,7 +6,7 @@ import casadi as ca
 import means
 import numpy as np
 import pytest
-from exports import FOLDER
+from exports import FOLDER, quick
 
 import covocp as co
 from covocp.export import export_c
@@ -44,7 +44,7 @@ def design():
 
 @pytest.fixture(scope="module", params=[PERIOD, None])
 def package(design, request):
-    return export_c(design, FOLDER / f"first_{request.param}", period=request.param)
+    return quick(export_c(design, FOLDER / f"first_{request.param}", period=request.param))
 
 
 def flights(law, values, always=True, density=Q, at_end=False):
@@ -173,7 +173,7 @@ def test_the_loop_as_it_flies_is_as_predicted(design, package):
 
 def test_spread_as_told_before_the_export_is_that_of_the_runs(design):
     samples = discretised(design_of(design, None), history(design, "double"), PERIOD)
-    law = export_c(design, FOLDER / "told", period=PERIOD).python()["step"]
+    law = quick(export_c(design, FOLDER / "told", period=PERIOD)).python()["step"]
     sample = co.simulate(design, 3000, 6, law=law, step=0.05, progress=False)
     told = np.sqrt(np.diagonal(samples.flown[-1]))
     assert np.abs(sample.deviations.std(axis=0) / told - 1).max() < 4 / np.sqrt(6000)

@@ -7,7 +7,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from exports import FOLDER
+from exports import FOLDER, quick
 from scipy.linalg import expm
 
 import covocp as co
@@ -90,7 +90,7 @@ def test_the_gain_after_init_is_the_one_that_is_flown():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", co.CovocpWarning)  # what half a second loses
         package = co.export_c(solution, FOLDER / "init_gain", period=period, largest_spread=float("inf"))
-    for laws in (package.python(), package.reference()):
+    for laws in (quick(package).python(), package.reference()):
         np.testing.assert_allclose(laws.state["feedback_gain"], gain, rtol=2e-6)
 
 
@@ -98,11 +98,11 @@ def test_spread_as_flown_is_that_of_the_compiled_law_in_the_actual_system(steep_
     samples = tables(steep_end, 0.1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", co.CovocpWarning)  # what a tenth of a second loses
-        package = co.export_c(steep_end, FOLDER / "steep_tenth", period=0.1)
+        package = quick(co.export_c(steep_end, FOLDER / "steep_tenth", period=0.1))
     assert package.check().ok
-    runs = co.simulate(steep_end, 500, seed=4, law=package.python(), progress=False)
+    runs = co.simulate(steep_end, 200, seed=4, law=package.python(), progress=False)
     predicted = np.sqrt(np.diagonal(samples.flown[-1]))
-    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 500))
+    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 200))
 
 
 def test_a_sampled_loop_promises_what_it_holds(steep_end):
@@ -120,7 +120,7 @@ def test_what_a_period_loses_is_refused_with_the_numbers(steep_end, tmp_path):
     spreads = pytest.warns(co.CovocpWarning, match="held over 4 s the loop spreads otherwise")
     with spreads, pytest.warns(co.CovocpWarning, match="held over 4 s the loop flies beside the nominal"):
         package = co.export_c(steep_end, tmp_path / "slow", period=4.0, largest_spread=float("inf"))
-    assert package.check().ok
+    assert quick(package).check().ok
 
 
 def test_what_a_period_loses_at_the_end_is_told_however_large_deviations_were_before(tmp_path):

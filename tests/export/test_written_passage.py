@@ -14,7 +14,8 @@ from exports import FOLDER, QUICK
 import covocp as co
 from covocp.export import CPackage, export_c
 from covocp.models import mass_chain, unknown_lag
-from covocp.passage import library
+from covocp.passage import library, ordering, sweep
+from covocp.passage.shape import shape
 from covocp.transcription import shooting
 
 # The meshes are coarse.
@@ -40,14 +41,19 @@ def plain(problem: co.Problem, name: str, monkeypatch: pytest.MonkeyPatch) -> CP
 
 
 @pytest.mark.needs_cc
-@pytest.mark.parametrize("masses", [1, 4])
-def test_plans_are_those_of_casadis_operations(masses: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 4 rows, and of 10 rows that are eliminated by their nonzeros."""
+@pytest.mark.parametrize(("masses", "share"), [(1, 0.0), (2, 1e9)])
+def test_plans_are_those_of_casadis_operations(masses: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 4 rows, and of 6 rows that are eliminated by their nonzeros."""
+    monkeypatch.setattr(ordering, "SMALLEST", 1)
+    monkeypatch.setattr(ordering, "LARGEST_SHARE", share)
+    monkeypatch.setattr(sweep, "shape", shape.__wrapped__)  # it is remembered by the pattern alone
     problem = mass_chain.problem(masses=masses)
     made = export_c(problem, FOLDER / f"chain_{masses}", **MESH)
     beside = plain(problem, f"chain_{masses}_plain", monkeypatch)
     assert CALL in code(made)
     assert CALL not in code(beside)
+    shapes = re.findall(r"passage_\w+\[\d+\] = \{\s*\d+, \d+, \d+, \d+, (\d),", code(made))
+    assert set(shapes) == {str(int(share > 1.0))}
     made.build(flags=QUICK)
     assert made.check().ok
     planner, reference = made.python(), beside.reference()

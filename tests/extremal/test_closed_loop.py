@@ -311,7 +311,7 @@ def test_terminal_costate_along_a_given_nominal():
 @cache
 def optimum(formulation, method="ipopt"):
     options = {"covariances": formulation, "covariance_step": "gauss"} if method == "ipopt" else {}
-    return solve(problem(), method=method, intervals=60, tolerance=1e-8, **options)
+    return solve(problem(), method=method, intervals=40, tolerance=1e-8, **options)
 
 
 @pytest.mark.parametrize(

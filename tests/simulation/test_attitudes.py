@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from attitudes import steered, tracked
+from exports import quick
 
 import covocp as co
 from covocp.blocks import so3
@@ -74,7 +75,7 @@ def test_the_discrete_extended_filter_corrects_by_rotations():
 
 
 def test_the_compiled_controller_points_as_python_does(tmp_path):
-    package = co.export_c(pointing(), tmp_path / "pointing")
+    package = quick(co.export_c(pointing(), tmp_path / "pointing"))
     assert "malloc" not in "".join(path.read_text() for path in (tmp_path / "pointing").glob("*.c"))
     assert package.check(200).ok
     sample = co.simulate(pointing(), 64, 5, law=package.python(), period=0.004, store=3, progress=False, step=0.004)
@@ -83,7 +84,7 @@ def test_the_compiled_controller_points_as_python_does(tmp_path):
 
 
 def test_an_exported_attitude_is_of_unit_length_between_the_nodes(tmp_path):
-    laws = co.export_c(pointing(), tmp_path / "unit", feedback=False).python()
+    laws = quick(co.export_c(pointing(), tmp_path / "unit", feedback=False)).python()
     for time in np.linspace(0.01, 3.99, 23):
         assert np.linalg.norm(laws.sample(time)["attitude"]) == pytest.approx(1.0, abs=1e-14)
 

@@ -8,7 +8,7 @@ import threading
 import casadi as ca
 import numpy as np
 import pytest
-from exports import lag, package
+from exports import lag, package, quick
 from loops import linear_quadratic, open_loop, steered
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -78,7 +78,7 @@ def exact_moments(q=0.1, r=0.025, spread=0.1, start=(1.0, 0.0), duration=3.0):
 
 
 def test_statistics_of_a_sampled_law_are_exact(design):
-    runs = 20_000
+    runs = 10_000
     sample = simulate(design, runs, 3, law=Proportional(), period=PERIOD, step=0.01, progress=False)
     mean, covariance = exact_moments()
     found = np.column_stack([sample.nominal[-1] + sample.deviations])[:, :2]
@@ -114,7 +114,7 @@ def test_the_exported_controller_tends_to_the_filter_of_the_design():
 
     The periods divide the mesh, so that the steps and with them the noises of a run are the same.
     """
-    options = {"runs": 192, "seed": 5, "step": 1 / 128, "progress": False}
+    options = {"runs": 64, "seed": 5, "step": 1 / 128, "progress": False}
     continuous = simulate(lag(), **options)
     distances = []
     for period in (1 / 8, 1 / 16, 1 / 32):
@@ -144,7 +144,7 @@ def test_a_controller_of_many_rows_tends_to_the_filter_of_the_design(tmp_path):
     solution = chain()
     options = {"runs": 64, "seed": 5, "step": 1 / 80, "store": 2, "progress": False}
     continuous = simulate(solution, **options)
-    law = co.export_c(solution, tmp_path / "chain").python()
+    law = quick(co.export_c(solution, tmp_path / "chain")).python()
     distances = []
     for period in (1 / 10, 1 / 20, 1 / 40):
         sampled = simulate(solution, law=law, period=period, **options)

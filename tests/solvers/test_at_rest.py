@@ -27,7 +27,7 @@ def regulator(*, unit: float = 1.0, dense: bool = False, constant: float = 0.0) 
     return ocp
 
 
-@pytest.mark.parametrize("intervals", [20, 100, 640])
+@pytest.mark.parametrize("intervals", [20, 640])
 @pytest.mark.parametrize("method", ["ipopt", "reduced", "auto", "gradient"])
 def test_rest_is_found_without_a_word(method, intervals):
     with warnings.catch_warnings():

@@ -15,6 +15,7 @@ import closed_loops
 import numpy as np
 import pytest
 from closed_loops import System, closed_loop, lag, nominal, piecewise_linear
+from optima import optimum
 from problems import graded
 from scipy.stats import linregress
 
@@ -382,8 +383,7 @@ CASES: dict[str, tuple[co.Problem, dict[str, Any], float]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_same_optimum_as_shooting(name: str) -> None:
     problem, options, tolerance = CASES[name]
-    solution = solve(problem, intervals=30, **options)
-    shooting = co.solve(problem, progress=False, intervals=30, **options)
+    solution, shooting = (optimum(problem, method, intervals=30, **options) for method in ("gradient", "ipopt"))
     assert solution.cost == pytest.approx(shooting.cost, rel=tolerance)
     assert solution.duration == pytest.approx(shooting.duration, rel=1e-5)
     np.testing.assert_allclose(solution.multipliers.final, shooting.multipliers.final, atol=1e-3)
@@ -404,7 +404,8 @@ def assert_optimal(solution: co.Solution, shooting: co.Solution) -> None:
 def test_mars_entry_gains_most_in_ten_iterations() -> None:
     # From the constant ratio 0.5, on intervals of 5 s; the optimum is 5.7667749e-4.
     guess = {mars_entry.LIFT_TO_DRAG: np.full(184, mars_entry.REFERENCE)}
-    solution = solve(mars_entry.problem(), intervals=183, guess=guess, max_iterations=10, allow_failure=True)
+    solver = co.Solver(mars_entry.problem(), "gradient", intervals=183, max_iterations=10)
+    solution = solver.solve(guess=guess, allow_failure=True, progress=False, assess=False)
     costs = np.array([row["cost"] for row in solution.stats["history"]])
     assert costs[0] == pytest.approx(6.57123e-4, rel=1e-5)
     assert (np.diff(costs) < 0).all()
