@@ -8,5 +8,5 @@ import covocp as co
 
 
 def optimum(problem: co.Problem, method: str = "ipopt", guess: Any = None, **options: Any) -> co.Solution:
-    """What `solve` finds, without what it looks at after a run: errors of the mesh, curvature and doubts take longer."""
+    """What `solve` finds, without what it looks at after a run: mesh errors, curvature, doubts take longer."""
     return co.Solver(problem, method, **options).solve(guess=guess, progress=False, assess=False)
