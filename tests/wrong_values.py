@@ -93,6 +93,7 @@ VALUES: dict[str, Callable[[], Any]] = {
 # Those that say little that others do not.
 RARE = (
     *("another word", "an empty text", "0", "half", "a fraction", "a decimal", "a list of None", "a dict of numbers"),
+    *("10**30", "bytes", "a set", "a date"),
     *("a class", "an empty array", "an array of dates", "an MX", "another problem", "an error", "a function of CasADi"),
 )
 

@@ -93,8 +93,9 @@ def test_an_entry_of_a_quaternion_has_its_own_band():
     solution = spun(0.8)
     half = 0.8 * np.pi * solution.t / 2
     shares = (np.abs(np.sin(half)), np.abs(np.cos(half)), np.ones_like(half), np.ones_like(half))
+    drawn = panels(solution.plot(*(f"C[{k}]" for k in range(4))))
     for k, share in enumerate(shares):
-        axes = panels(solution.plot(f"C[{k}]"))[f"C q{k}"]
+        axes = drawn[f"C q{k}"]
         (curve,) = (line.get_ydata() for line in main_lines(axes))
         assert [curve[0], curve[-1]] == pytest.approx(solution["C"][[0, -1], k], abs=1e-12)
         low, high = edges_of(axes, solution.t)
@@ -110,7 +111,7 @@ def test_an_entry_of_the_error_has_a_root_mean_square():
 
 
 def test_no_ellipse_of_the_error_stands_about_entries_of_the_quaternion():
-    solution = co.solve(correlated(), intervals=8, progress=False)
+    solution = co.evaluate(correlated(), nominal={"u": 1.0}, intervals=8)
     (axes,) = panels(solution.plot("p", over="C[1]")).values()
     assert len(axes.lines) == 4  # the curve, its start, both edges of its band
     assert len(panels(solution.plot("p", over="y"))["p"].lines) > 6

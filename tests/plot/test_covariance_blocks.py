@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from covocp.plot.figure import COLOURS, DASHES, plot_solutions
 from covocp.plot.panels import COLOURED, DASHED
 
 
+@cache
 def correlated():
     """Three positions with a covariance of their own, and an attitude."""
     ocp = co.Problem(1.0, "correlated")
@@ -22,7 +25,7 @@ def correlated():
     ocp.dynamics(p, u, noise=[0.1, 0.2, 0.3])
     ocp.estimation_covariance()
     ocp.minimize(running=ca.sumsqr(u - 1))
-    return co.solve(ocp, intervals=8, progress=False), root @ root.T
+    return co.evaluate(ocp, nominal={"u": 1.0}, intervals=8), root @ root.T
 
 
 def test_entries_of_a_symmetric_block_are_drawn_once_and_told_apart():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import pickle
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -271,9 +272,10 @@ def test_files_and_what_is_refused(bounced: Any, tmp_path: Path) -> None:
         co.simulate(solution, 10, seed=1)
 
 
-@pytest.mark.parametrize("filter", ["perturbation", "extended"])
-def test_a_single_state_without_unknowns_goes_on(filter: Any) -> None:
-    problems = []
+@cache
+def steady() -> co.PhasesSolution:
+    """A single state in two phases, without feedback."""
+    problems: list[co.Problem] = []
     for name in ("first", "second"):
         ocp = co.Problem(1.0, name=name)
         start: dict[str, Any] = {"initial": None} if problems else {"initial": 1.0, "variance": 0.1}
@@ -283,8 +285,12 @@ def test_a_single_state_without_unknowns_goes_on(filter: Any) -> None:
         ocp.estimation_covariance()
         ocp.minimize(running=u**2)
         problems.append(ocp)
-    solution = co.solve(co.Phases(problems), intervals=10, **QUIET)
-    sample = co.simulate(solution, 1000, seed=1, filter=filter, **QUIET)
+    return co.solve(co.Phases(problems), intervals=10, **QUIET)
+
+
+@pytest.mark.parametrize("filter", ["perturbation", "extended"])
+def test_a_single_state_without_unknowns_goes_on(filter: Any) -> None:
+    sample = co.simulate(steady(), 1000, seed=1, filter=filter, **QUIET)
     # Without feedback the variance is 0.1 + 0.1 t; E starts at its steady value sqrt(0.1 * 0.1) and stays there.
     for k, phase in enumerate(sample):
         np.testing.assert_allclose(phase.predicted[-1], 0.1 + 0.1 * (k + 1), rtol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -169,9 +170,14 @@ def moved(P: Any, F: Any, T: float) -> Any:
     return solve_ivp(rate, (0.0, T), P.ravel(), rtol=1e-10, atol=1e-12).y[:, -1].reshape(F.shape)
 
 
+@cache
+def designed() -> co.PhasesSolution:
+    return co.solve(thrown(), intervals=10, **QUIET)
+
+
 @pytest.mark.parametrize("given", ["phases", "values"])
 def test_another_jump_and_other_means_by_hand(given: str) -> None:
-    design = co.solve(thrown(), intervals=10, **QUIET)
+    design = designed()
     factor, shift = (-0.5, 0.3) if given == "phases" else (-0.8, 0.0)
     truth = thrown(factor, shift, mean=0.8, appearing=-0.4) if given == "phases" else {"b": 0.8, "q": -0.4}
     sample = co.simulate(design, 2048, seed=3, step=0.05, truth=truth, **QUIET)

@@ -142,7 +142,7 @@ def chain(masses=5):
 
 def test_a_controller_of_many_rows_tends_to_the_filter_of_the_design(tmp_path):
     solution = chain()
-    options = {"runs": 64, "seed": 5, "step": 1 / 80, "store": 2, "progress": False}
+    options = {"runs": 24, "seed": 5, "step": 1 / 80, "store": 2, "progress": False}
     continuous = simulate(solution, **options)
     law = quick(co.export_c(solution, tmp_path / "chain")).python()
     distances = []

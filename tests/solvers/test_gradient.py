@@ -322,7 +322,7 @@ def test_dependent_conditions_are_an_error() -> None:
 def test_stop_test_does_not_depend_on_the_weighting() -> None:
     problem = unknown_lag.problem(weight=1.0, final=1.0)
     first, ends = [], []
-    for weight, factor in ((1.5, 1.0), (3.0, 1.0), ("curvature", 2.0), ("adaptive", 1.0)):
+    for weight, factor in ((1.5, 1.0), ("curvature", 2.0), ("adaptive", 1.0)):
         solution = optimum(problem, "gradient", weight=weight, weight_factor=factor, intervals=20)
         first.append(solution.stats["history"][0]["slope"])
         ends.append(solution)

@@ -132,7 +132,7 @@ def test_meshes_are_refined_and_limits_hold_between_the_nodes():
     assert solution.cost == pytest.approx(4.0, rel=2e-5)
     fine = solution.at(np.linspace(0, 1, 5000))["x"]
     assert fine[:, 0].max() < 1 / 9 + 1e-5
-    known = optimum(measured(2, 0), intervals=200).cost
+    known = optimum(measured(2, 0), intervals=100).cost
     for method in ("reduced", "auto"):
         found = co.solve(measured(2, 0), method, refine=1e-5)
         assert found.cost == pytest.approx(known, rel=3e-5)
