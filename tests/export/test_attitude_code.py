@@ -35,7 +35,7 @@ def seen(first: Any) -> co.Problem:
 
 MAKERS = {"slew": lambda first: attitudes.slew(first, GOAL)[0], "seen": seen}
 # code of second derivatives grows with the steps
-MESHES: dict[str, dict[str, Any]] = {"slew": FEW | {"substeps": 1}, "seen": FEW}
+MESHES: dict[str, dict[str, Any]] = {"slew": FEW | {"substeps": 1}, "seen": FEW | {"substeps": 2}}
 
 
 @cache
