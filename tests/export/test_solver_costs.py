@@ -84,7 +84,7 @@ def test_costs_are_those_of_the_converged_optimum(case):
 def test_plans_along_a_singular_arc_are_right_or_told():
     """From which starts the quadratic subproblems give up there is a matter of rounding; the status says so."""
     short = {"max_iter": 25, "qpsol_options": {"max_iter": 150, "error_on_fail": False, **SILENT}}
-    made = export_c(goddard_rocket.problem(), FOLDER / "arc", intervals=10, substeps=2, plugin_options=short)
+    made = export_c(goddard_rocket.problem(), FOLDER / "arc", intervals=8, substeps=2, plugin_options=short)
     planner, found = made.reference(), []
     for start in ({}, *({"initial_h": height} for height in np.linspace(1.0003, 1.0021, 7).tolist())):
         plan = planner(**start)
