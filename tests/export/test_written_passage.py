@@ -124,14 +124,11 @@ def test_the_same_package_is_written_again(tmp_path: Path, monkeypatch: pytest.M
 def test_few_segments_are_exported_unless_changes_grow_or_they_are_asked_for(tmp_path: Path) -> None:
     """Constraints: the continuity of a state where segments meet, beside those of the problem itself."""
 
-    def segments(problem: co.Problem, name: str, **options: int) -> int:
-        counts = []
-        for own, given in ((name, options), (f"{name}_one", {"segments": 1})):
-            made = export_c(problem, tmp_path / own, intervals=40, substeps=2, **given)
-            found = re.search(r"/\* nlp:\(.*\)->\(x\[\d+\],f,g(\[\d+\]|),", code(made))
-            assert found is not None
-            counts.append(int(found[1].strip("[]") or 1))
-        return counts[0] - counts[1] + 1
+    def constraints(problem: co.Problem, name: str, **options: int) -> int:
+        made = export_c(problem, tmp_path / name, intervals=40, substeps=2, **options)
+        found = re.search(r"/\* nlp:\(.*\)->\(x\[\d+\],f,g(\[\d+\]|),", code(made))
+        assert found is not None
+        return int(found[1].strip("[]") or 1)
 
     ocp = co.Problem(duration=30.0)
     x, u = ocp.state("x", initial=0.1, final=0.0, variance=0.1), ocp.control("u")
@@ -139,6 +136,8 @@ def test_few_segments_are_exported_unless_changes_grow_or_they_are_asked_for(tmp
     ocp.measurement("y", x, noise=0.1)
     E = ocp.estimation_covariance()
     ocp.minimize(running=u**2, terminal=E[x, x])
-    assert segments(unknown_lag.problem(), "lag") == 2
-    assert segments(unknown_lag.problem(), "asked", segments=5) == 5
-    assert segments(ocp, "unstable") == 3
+    lag = unknown_lag.problem()
+    of_one = constraints(lag, "one", segments=1)
+    assert constraints(lag, "lag") - of_one + 1 == 2
+    assert constraints(lag, "asked", segments=5) - of_one + 1 == 5
+    assert constraints(ocp, "unstable") - constraints(ocp, "unstable_one", segments=1) + 1 == 3
