@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, QUICK, package
-from optima import optimum
+from problems import unassessed
 
 import covocp as co
 from covocp.export import export_c
@@ -208,7 +208,7 @@ def test_a_matrix_parameter_is_given_as_it_is():
     made.build(flags=QUICK)
     assert made.check().ok
     changed = np.array([[0.1, 0.7], [-1.5, -0.2]])
-    known, other = (optimum(pulled(meant), intervals=8, substeps=2).cost for meant in (matrix, changed))
+    known, other = (unassessed(pulled(meant), intervals=8, substeps=2).cost for meant in (matrix, changed))
     for planner in (made.reference(), made.python()):
         for given, cost in (
             ({}, known),

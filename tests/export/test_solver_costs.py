@@ -9,9 +9,9 @@ from fractions import Fraction
 
 import casadi as ca
 import numpy as np
-import optima
 import pytest
 from exports import FOLDER
+from problems import unassessed
 
 import covocp as co
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
@@ -68,7 +68,7 @@ def optimum(problem, plan, **options):
     """The least cost on the nodes of a plan, from its controls."""
     guess = {control.name: plan[control.name] for control in problem.controls}  # of two mirror images this one
     nodes = plan["time"].ravel() / plan["time"].ravel()[-1]  # a mesh graded for the start of the export stays so
-    return optima.optimum(problem, grid=nodes, guess=guess, plugin_options=TIGHT, **options).cost
+    return unassessed(problem, grid=nodes, guess=guess, plugin_options=TIGHT, **options).cost
 
 
 @pytest.mark.parametrize("case", CASES)

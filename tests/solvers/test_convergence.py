@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from optima import optimum
+from problems import unassessed
 from random_problems import draw
 
 import covocp as co
@@ -191,7 +191,7 @@ def correlated(seed: int) -> co.Problem:
 
 def test_inequality_at_the_end_is_active_or_has_no_multiplier() -> None:
     gradient = co.solve(correlated(0), "gradient", intervals=20, progress=False)
-    shooting = optimum(correlated(0), intervals=20, guess=gradient, tolerance=1e-9)
+    shooting = unassessed(correlated(0), intervals=20, guess=gradient, tolerance=1e-9)
     assert gradient.cost == pytest.approx(shooting.cost, rel=1e-5)
     assert gradient.optimality.complementarity is not None
     assert gradient.optimality.complementarity < 1e-4
@@ -199,7 +199,7 @@ def test_inequality_at_the_end_is_active_or_has_no_multiplier() -> None:
 
 @pytest.mark.parametrize("seed", [1, 9])
 def test_gradient_method_finds_what_shooting_finds(seed: int) -> None:
-    gradient, shooting = (optimum(draw(seed).problem, method, intervals=30) for method in ("gradient", "ipopt"))
+    gradient, shooting = (unassessed(draw(seed).problem, method, intervals=30) for method in ("gradient", "ipopt"))
     assert gradient.cost == pytest.approx(shooting.cost, rel=1e-5)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from optima import optimum
+from problems import unassessed
 
 import covocp as co
 from covocp.models import (
@@ -171,7 +171,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_same_cost_as_shooting(name: str) -> None:
     problem, options = CASES[name]
-    gradient, shooting = (optimum(problem, method, **options) for method in ("gradient", "ipopt"))
+    gradient, shooting = (unassessed(problem, method, **options) for method in ("gradient", "ipopt"))
     assert gradient.cost == pytest.approx(shooting.cost, rel=1e-6)
     np.testing.assert_allclose(
         gradient.multipliers.final,
@@ -323,7 +323,7 @@ def test_stop_test_does_not_depend_on_the_weighting() -> None:
     problem = unknown_lag.problem(weight=1.0, final=1.0)
     first, ends = [], []
     for weight, factor in ((1.5, 1.0), ("curvature", 2.0), ("adaptive", 1.0)):
-        solution = optimum(problem, "gradient", weight=weight, weight_factor=factor, intervals=20)
+        solution = unassessed(problem, "gradient", weight=weight, weight_factor=factor, intervals=20)
         first.append(solution.stats["history"][0]["slope"])
         ends.append(solution)
     np.testing.assert_allclose(first, first[0], rtol=1e-12)

@@ -15,8 +15,7 @@ import closed_loops
 import numpy as np
 import pytest
 from closed_loops import System, closed_loop, lag, nominal, piecewise_linear
-from optima import optimum
-from problems import graded
+from problems import graded, unassessed
 from scipy.stats import linregress
 
 import covocp as co
@@ -383,7 +382,7 @@ CASES: dict[str, tuple[co.Problem, dict[str, Any], float]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_same_optimum_as_shooting(name: str) -> None:
     problem, options, tolerance = CASES[name]
-    solution, shooting = (optimum(problem, method, intervals=30, **options) for method in ("gradient", "ipopt"))
+    solution, shooting = (unassessed(problem, method, intervals=30, **options) for method in ("gradient", "ipopt"))
     assert solution.cost == pytest.approx(shooting.cost, rel=tolerance)
     assert solution.duration == pytest.approx(shooting.duration, rel=1e-5)
     np.testing.assert_allclose(solution.multipliers.final, shooting.multipliers.final, atol=1e-3)

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from optima import optimum
+from problems import unassessed
 
 import covocp as co
 from covocp.transcription.scales import magnitudes
@@ -45,7 +45,7 @@ def tracking(start: tuple[float, float] = (0.0, 0.0)) -> co.Problem:
 def test_states_that_are_known_exactly_from_elsewhere(moved: dict[str, Any], start: tuple[float, float]):
     """It had ended with 'the penalties do not remove the violations', of 1e-30, of the variance of s."""
     found = co.Solver(tracking(), "gradient", intervals=40).solve(progress=False, assess=False, **moved)
-    fresh = optimum(tracking(start), intervals=40)
+    fresh = unassessed(tracking(start), intervals=40)
     assert found.cost == pytest.approx(fresh.cost, rel=1e-6)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from optima import optimum
+from problems import unassessed
 from random_problems import draw, true_cost
 from scipy.optimize import brentq
 
@@ -81,7 +81,7 @@ def test_closed_forms_with_a_free_duration_and_a_state_dependent_noise():
 def test_it_ends_where_ipopt_ends(kinds):
     for seed in range(2):
         problem = measured(2 + seed, seed, **dict.fromkeys(kinds, True))
-        one, other = (optimum(problem, method, intervals=15) for method in ("ipopt", "reduced"))
+        one, other = (unassessed(problem, method, intervals=15) for method in ("ipopt", "reduced"))
         assert other.cost == pytest.approx(one.cost, rel=1e-7)
         assert other["u"] == pytest.approx(one["u"], abs=2e-3 * np.abs(one["u"]).max() + 1e-6)
         size = np.abs(one.costates.state).max()
@@ -132,7 +132,7 @@ def test_meshes_are_refined_and_limits_hold_between_the_nodes():
     assert solution.cost == pytest.approx(4.0, rel=2e-5)
     fine = solution.at(np.linspace(0, 1, 5000))["x"]
     assert fine[:, 0].max() < 1 / 9 + 1e-5
-    known = optimum(measured(2, 0), intervals=100).cost
+    known = unassessed(measured(2, 0), intervals=100).cost
     for method in ("reduced", "auto"):
         found = co.solve(measured(2, 0), method, refine=1e-5)
         assert found.cost == pytest.approx(known, rel=3e-5)
