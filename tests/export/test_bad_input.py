@@ -84,10 +84,8 @@ def spoilt(law):
     lines = []
     for port in law.inputs:
         field = law.held.get(port.name)
-        if field == "index":
-            lines.append("self.index = indices[pick(9)];")
-        elif field in ("passed", "overdue"):  # int: the largest ones become larger by one sample, and are none then
-            lines.append(f"self.{field} = indices[1 + pick(7)];")
+        if field in ("index", "passed", "overdue"):
+            lines.append(f"self.{field} = indices[pick(9)];")
         elif field is not None:
             lines.append(f"spoil({'&' if port.scalar else ''}self.{field}, {port.size});")
     return " ".join(lines)

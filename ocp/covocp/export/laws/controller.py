@@ -224,7 +224,7 @@ def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Ex
     }
     if design.always:
         fields["expected"] = ca.if_else(more, ahead.expected, 0.0)
-    fields["overdue"] = ca.if_else(ca.logic_and(valid, ca.logic_not(more)), found.apart, given.overdue)
+    fields["overdue"] = ca.if_else(ca.logic_and(valid, ca.logic_not(more)), found.apart, given.overdue != 0.0)
     return Stepped(fields=fields, more=more, good=good, missing=found.missing)
 
 

@@ -120,9 +120,10 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     period = samples.period
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
-    summed, passed = ca.MX.sym("expected", always), ca.MX.sym("passed")
+    summed, given = ca.MX.sym("expected", always), ca.MX.sym("passed")
     least = NO_STEP if design.reads_first else 0.0
     begun = ca.fmax(last, least)  # a struct that was never set must not lead out of the tables
+    passed = ca.fmin(ca.fmax(given, 0.0), float(samples.count))  # nor to a count that is no int
     clock = tables.clock(time, ca.fmax(begun, 0.0) * period)
     wanted = ca.fmin(ca.fmax(ca.floor(clock.time / period + 0.5), 0.0), float(samples.count))
     backwards = wanted < begun
@@ -166,7 +167,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     }
     core = ca.Function(
         "step",
-        [y, last, held, measured, time, *((summed, passed) if always else ())],
+        [y, last, held, measured, time, *((summed, given) if always else ())],
         [flat(v) for v in fields.values()],
     )
     return _law(design, tables, samples, core, fields, tolerance)
