@@ -248,7 +248,7 @@ def test_where_no_feedback_can_help_no_other_way_is_tried_or_named(options):
 def test_a_gain_of_a_structure_that_fails_by_steps_of_rk4_is_found_by_gauss_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where the guess has a gain the best one is none. What fails takes hundreds of iterations: here it is cut short."""
+    """A guess that has a gain replaces the best one. What fails takes hundreds of iterations: here it is cut short."""
     own = solver.from_starts
 
     def cut(prepared, values, guesses, reporter):
