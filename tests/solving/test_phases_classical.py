@@ -142,3 +142,39 @@ def test_a_limit_of_iterations_is_kept() -> None:
     found = co.solve(cut(drawn, CASES[0][-1]), max_iterations=2, allow_failure=True, **QUIET)
     assert not found.converged
     assert found.stats["iterations"] <= 2
+
+
+def pushed(first: bool, limit: float = np.inf) -> tuple[co.Problem, ca.MX, ca.MX]:
+    p = co.Problem(1.0, name="first" if first else "second")
+    b = p.unknown("b", mean=0.5, variance=0.05)
+    x = p.state("x", initial=1.0 if first else None, variance=1e-4 if first else None)
+    u = p.control("u")
+    p.dynamics(x, u, noise=1e-4)
+    p.measurement("y", x, noise=0.01)
+    if not first and limit < np.inf:
+        p.subject_to(x + b, upper=limit, at="final", name="wall")
+    p.minimize_expected(running=u**2 / 2 + (x**2 if limit == np.inf else (x - 2.0) ** 2 / 2))
+    return p, x, b
+
+
+@pytest.mark.parametrize("method", ["ipopt", "auto"])
+def test_the_mean_of_what_is_unknown_moves_the_nominal(method: str) -> None:
+    """x' = u, x+ = x + b, cost u^2/2 + x^2: a leg from y to z costs q ((y^2 + z^2) cosh q - 2 y z) / (2 sinh q)."""
+    (one, x, b), (two, later, _) = pushed(True), pushed(False)
+    phases = co.Phases([one, two])
+    phases.jump(later, x + b)
+    found = co.solve(phases, method, intervals=20, **QUIET)
+    q = np.sqrt(2.0)
+    ratio, rest = q / np.sinh(q), q * np.tanh(q)  # of the first leg; of the second, whose end is free
+    end = (ratio - 0.5 * rest) / (q / np.tanh(q) + rest)
+    assert found["first"]["x"][-1].item() == pytest.approx(end, abs=1e-4)
+    assert found["second"]["x"][0].item() == pytest.approx(end + 0.5, abs=1e-4)
+    assert found.stats["iterations"] < 5
+
+
+def test_a_wall_at_an_unknown_place_is_kept() -> None:
+    (one, _, _), (two, _, _) = pushed(True, 1.0), pushed(False, 1.0)
+    found = co.solve(co.Phases([one, two]), intervals=20, **QUIET)
+    assert found["second"]["x"][-1].item() == pytest.approx(0.5, abs=1e-6)
+    other = co.solve(co.Phases([one, two]), intervals=20, max_iterations=3000, **QUIET)
+    assert found.cost == pytest.approx(other.cost, rel=1e-6)

@@ -263,3 +263,25 @@ def test_a_jump_that_leaves_no_covariance_is_one() -> None:
     phases.jump(y, x, noise=noise)
     with pytest.raises(co.ProblemError, match="negative"):
         co.solve(phases, intervals=20, parameters={"noise": -0.5}, **QUIET)
+
+
+def swing(duration: float, *, first: bool, last: bool) -> co.Problem:
+    """A swing whose stiffness is not known, and is not fed back."""
+    ocp = co.Problem(duration, name="first" if first else "second")
+    x = ocp.state("x", initial=0.2 if first else None, final=0.2 if last else None, variance=0.4 if first else None)
+    v = ocp.state("v", initial=-0.25 if first else None, variance=0.1 if first else None)
+    b, u = ocp.unknown("b", mean=0.9, variance=0.9), ocp.control("u")
+    ocp.dynamics(x, v, noise=0.01)
+    ocp.dynamics(v, -b * x - 0.3 * v + u, noise=0.02)
+    ocp.measurement("m", x, noise=0.05)
+    weight = {x: 1.7, v: 1.0} if last else None
+    ocp.minimize_expected(running=0.3 * u**2 + 0.5 * x**2, terminal_weight=weight, gain=co.Gain(structure=[[1, 1, 0]]))
+    return ocp
+
+
+def test_a_gain_of_a_structure_begins_at_the_best_gain_in_phases_too() -> None:
+    whole = co.solve(swing(2.0, first=True, last=True), "gradient", intervals=25, progress=False)
+    parts = [swing(0.8, first=True, last=False), swing(1.2, first=False, last=True)]
+    phases = co.solve(co.Phases(parts), intervals=6, progress=False)
+    assert phases.stats["iterations"] < 30
+    assert phases.cost == pytest.approx(whole.cost, rel=2e-4)

@@ -148,7 +148,7 @@ def _left(statement: Statement, nominal: Solution, run: Outcome, parameters: Arr
     if moved <= DRIFTED:
         return None
     suffered = float(_defects(statement, run.extremal, states, parameters).sum())
-    if moved <= UNSTABLE * suffered or not _is_path(statement, own, t.x[0], parameters):
+    if moved <= UNSTABLE * suffered or not is_path(statement, own, t.x[0], parameters):
         return None
     return states
 
@@ -158,10 +158,10 @@ def _plain(blocks: tuple[Block, ...]) -> list[tuple[str, str, int]]:
     return [(b.kind, b.name, b.size) for b in blocks if b.kind in ("state", "control")]
 
 
-def _defects(statement: Statement, along: Extremal, x: Array, parameters: Array) -> Array:
-    """By how much each interval of a mesh leaves states at its nodes, in magnitudes of these, (N,)."""
+def _defects(statement: Statement, along: Extremal, x: Array, parameters: Array, sizes: Array | None = None) -> Array:
+    """By how much each interval of a mesh leaves states at its nodes, in their sizes or magnitudes there, (N,)."""
     mesh, t = along.mesh, along.trajectory
-    sizes = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
+    sizes = np.maximum(np.abs(x).max(axis=0) if sizes is None else sizes, np.finfo(float).tiny)
     advance = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)
     intervals = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(parameters))
     ends = np.asarray(advance(x[:-1].T, *intervals)[0].full()).T
@@ -169,11 +169,20 @@ def _defects(statement: Statement, along: Extremal, x: Array, parameters: Array)
         return np.asarray((np.abs(ends - x[1:]) / sizes).max(axis=1))
 
 
-def _is_path(statement: Statement, own: Extremal, start: Array, parameters: Array) -> bool:
-    """Whether a trajectory is by its own steps one of a system from a start, that its intervals do not leave."""
+def is_path(statement: Statement, own: Extremal, start: Array, parameters: Array, sizes: Array | None = None) -> bool:
+    """Whether a trajectory is by its own steps one of a system from a start, that its intervals do not leave.
+
+    Args:
+        statement: the system.
+        own: the trajectory.
+        start: where it is to begin, (nx,).
+        parameters: of the system.
+        sizes: of the states, (nx,); None: their magnitudes along the trajectory.
+    """
     x = own.trajectory.x
-    apart = (np.abs(start - x[0]) / np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)).max(initial=0.0)
-    return bool(apart + _defects(statement, own, x, parameters).sum() <= SAME_PATH)
+    sizes = np.maximum(np.abs(x).max(axis=0) if sizes is None else sizes, np.finfo(float).tiny)
+    apart = (np.abs(start - x[0]) / sizes).max(initial=0.0)
+    return bool(apart + _defects(statement, own, x, parameters, sizes).sum() <= SAME_PATH)
 
 
 def _started_like(

@@ -25,7 +25,9 @@ from covocp.transcription.mesh import Mesh, Options
 
 # Iterations with other steps: what finds a way by them mostly takes fewer, and each takes long.
 MOST_ITERATIONS = 150
-STEPS, HESSIAN = {"covariance_step": "gauss"}, {"hessian": "limited-memory"}
+STEPS: dict[str, Any] = {"covariance_step": "gauss"}
+HESSIAN: dict[str, Any] = {"hessian": "limited-memory"}
+STEPS_IN_WORDS = "covariance_step='gauss'"
 
 
 class Way(NamedTuple):
@@ -53,7 +55,7 @@ def other_ways(
         taken: names of those that the method takes; "auto", which lets Ipopt run where a gain is free, has fewer.
     """
     if options.covariance_step == "auto" and mesh.step == "rk4" and statement.riccati_forms:
-        yield Way("covariance_step='gauss'", None, STEPS, {})
+        yield Way(STEPS_IN_WORDS, None, STEPS, {})
     if own.get("hessian", "auto") == "auto" and not mesh.eliminated:
         if "hessian" in taken:
             yield Way("hessian='limited-memory'", None, {}, HESSIAN)

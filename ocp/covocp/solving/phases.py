@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from covocp.base.errors import ProblemError, SolveError, evaluating, no_option, warn_user
+from covocp.base.errors import CovocpError, ProblemError, SolveError, evaluating, no_option, warn_user
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
 from covocp.extremal.densities import impossible_in_phases
@@ -18,11 +18,12 @@ from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_gap, mention_limits
 from covocp.solution.patience import longest
 from covocp.solution.phases import PhasesSolution
-from covocp.solution.report import stated_first
-from covocp.solving.attempts import interrupted
+from covocp.solution.report import OTHERWISE, stated_first
+from covocp.solving.attempts import counted, interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
 from covocp.solving.failure import impossible_noises, with_stalled
 from covocp.solving.methods import METHODS, mesh_options, method_options
+from covocp.solving.other_ways import MOST_ITERATIONS, STEPS, STEPS_IN_WORDS
 from covocp.solving.phases_classical import without_noise
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
 from covocp.solving.phases_given import intervals_of, of_each, values_of
@@ -89,15 +90,39 @@ def solve_phases(
         asked = graded_for(best, asked)
         near = meeting_conditions(phases, best, parameters or {})
         starts = [list(near), list(best)] if near is not best else [list(best)]
-    classical = without_noise(phases, chain) if random is None and _may_be_had(method, asked[0], own) else None
+    at_once = random is None and _may_be_had(method, asked[0], own)
+    classical = without_noise(phases, chain, parameters or {}) if at_once else None
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         runs = ChainRuns(chain, method, prepare, own, reporter, values, starts, classical)
         outcome = runs.solve(asked, random)
+        if best is not None and method in (BEST, "auto") and not (outcome.converged or "max_iterations" in own):
+            most = Progress("", show=False, iterations=MOST_ITERATIONS, within=reporter)
+            outcome = _by_gauss_steps(outcome, asked, ChainRuns(chain, method, prepare, own, most, values, starts))
         outcome = with_stalled(_if_possible(chain, outcome), reporter)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
             raise interrupted(solution)
     return _finished(solution, allow_failure)
+
+
+def _by_gauss_steps(failed: ChainOutcome, asked: tuple[Options, ...], runs: ChainRuns) -> ChainOutcome:
+    """The outcome by Gauss steps where others lost a gain that is optimised, see `other_ways`; else as it failed.
+
+    Args:
+        failed: the run before.
+        asked: options of the meshes.
+        runs: from the same starts, with so many iterations.
+    """
+    if runs.progress.stop or any(own.covariance_step != "auto" or own.covariances == "eliminated" for own in asked):
+        return failed
+    try:
+        again = runs.solve(tuple(replace(own, **STEPS) for own in asked))
+    except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved
+        return failed
+    both = counted(failed, again)
+    if not again.converged:
+        return replace(failed, stats={**failed.stats, **both})
+    return replace(again, stats={**again.stats, **both, OTHERWISE: STEPS_IN_WORDS})
 
 
 def _preparing(method: str, module: str, nominal: str) -> Callable[..., Any]:

@@ -7,32 +7,46 @@ Hessian of limited memory creeps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from covocp.base.dataclass import dataclass
 from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.extremal import Outcome
+from covocp.extremal.extremal import Extremal, Outcome
+from covocp.extremal.fine_mesh import refined
+from covocp.extremal.given_controls import missed
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.problem.expected_cost import deterministic
 from covocp.problem.phases import Phases, with_declarations
 from covocp.solving.from_classical import impatient, is_stationary, run_around, shared_multipliers
+from covocp.solving.given_nominal import is_path
+from covocp.solving.phases_given import values_of
 from covocp.statement.chain import Chain, Link
 from covocp.transcription.mesh import Mesh
 
 Arrays = tuple[Array, ...]
 
 
-def without_noise(phases: Phases, chain: Chain) -> Chain | None:
+class Deterministic(NamedTuple):
+    """The deterministic problem of phases, and its parameters, which are fewer than those of the whole."""
+
+    chain: Chain
+    values: Arrays
+
+
+def without_noise(phases: Phases, chain: Chain, parameters: Mapping[str, Any]) -> Deterministic | None:
     """The deterministic problem of phases where it is a quadratic program that has their optimum; None where it is not.
 
     Args:
         phases: with expected costs.
         chain: of these.
+        parameters: values of parameters and unknowns other than the declared ones, by name.
     """
     own = [problem.declarations for problem in phases.problems]
     if any(phase.expected is None for phase in own) or not all(map(impatient, chain.statements)):
@@ -40,7 +54,8 @@ def without_noise(phases: Phases, chain: Chain) -> Chain | None:
     if not all(map(_passes_alike, chain.links)):
         return None
     try:
-        return with_declarations(phases, [deterministic(phase) for phase in own]).chain()
+        found = with_declarations(phases, [deterministic(phase) for phase in own]).chain()
+        return Deterministic(found, values_of(found, parameters))
     except CovocpError:  # a phase whose cost depends on nothing that can be chosen
         return None
 
@@ -71,9 +86,37 @@ class AroundClassical:
         Args:
             strict: as exactly as a run would have it.
         """
+        if not self._is_path():
+            return None
         parts = zip(completed(self.outcome, self.links), self.outcome.cost_terms, strict=True)
         held = (is_stationary(own.extremal, terms, strict=strict, within=own.within) for own, terms in parts)
         return self.outcome if all(held) else None
+
+    def _is_path(self) -> bool:
+        """Whether the states are a path of the system through all phases, which meets the conditions.
+
+        With the parameters of the whole: multipliers of a quadratic program are the same wherever it lies.
+        """
+        before: Extremal | None = None
+        sizes: dict[str, float] = {}  # a state that has decayed is met as exactly as where it was large
+        for extremal in self.outcome.extremals:
+            for name, size in zip(
+                extremal.statement.state_names, np.abs(extremal.trajectory.x).max(axis=0), strict=True
+            ):
+                sizes[name] = max(float(size), sizes.get(name, 0.0))
+        for k, extremal in enumerate(self.outcome.extremals):
+            st, x, parameters = extremal.statement, extremal.trajectory.x, extremal.parameters
+            start = st.boundary_values(parameters)[0]
+            start = np.where(np.isnan(start), x[0], start)
+            if before is not None:
+                t, link = before.trajectory, self.links[k - 1]
+                given = link.values(t.x[-1], t.e[-1], t.duration, before.parameters, parameters)[0]
+                start[list(link.states)] = given
+            own = np.array([sizes[name] for name in st.state_names])
+            if not is_path(st, extremal, start, parameters, own) or missed(refined(extremal)):
+                return False
+            before = extremal
+        return True
 
 
 def around_classical(

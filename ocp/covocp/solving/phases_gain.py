@@ -21,7 +21,7 @@ from covocp.problem.closed_loop_covariance import reasons, with_best_gain
 from covocp.problem.declarations import Declarations
 from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.phase_chances import with_phase_chances
-from covocp.problem.phase_feedback import shares_gains
+from covocp.problem.phase_feedback import gains_of
 from covocp.problem.phases import Phases, with_declarations
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import ASKED
@@ -53,7 +53,7 @@ def best_gains(phases: Phases, guesses: Sequence[Any], solve: Solve) -> PhasesSo
         Interrupted: after Ctrl-C (carries what was found of the best gains until then).
     """
     own = declared(phases)
-    if not shares_gains(own) or not all(map(_leaves_open, guesses)):
+    if own[0].expected is None or gains_of(own) is None or not all(map(_leaves_open, guesses)):
         return None
     for conditions in (True, False):
         if not conditions and not any(reasons(phase) for phase in own):

@@ -25,7 +25,7 @@ from covocp.solving.failure import with_stalled
 from covocp.solving.from_classical import SOON
 from covocp.solving.longer import longer, may_be_too_short
 from covocp.solving.other_minima import TURNS, unless_it_fails
-from covocp.solving.phases_classical import AroundClassical, around_classical
+from covocp.solving.phases_classical import AroundClassical, Deterministic, around_classical
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
 from covocp.solving.refined_meshes import Measured, remade
@@ -37,7 +37,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.grading import graded
 from covocp.transcription.halved_steps import refined_run
-from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.mesh import Mesh, Options, with_substeps
 from covocp.transcription.mirrored import COMBINED, conditions_on_matrices
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Trajectory
@@ -78,7 +78,7 @@ class ChainRuns:
         reporter: Progress,
         values: Arrays,
         guesses: list[list[Any]],
-        classical: Chain | None = None,
+        classical: Deterministic | None = None,
     ) -> None:
         """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed.
 
@@ -209,10 +209,11 @@ class ChainRuns:
         if self._classical is None or self._reporter.limited or self._reporter.stop:
             return None
         none: list[list[Any]] = [[None] * len(options)]
-        given = tuple(own[: st.np] for own, st in zip(values, self._classical.statements, strict=True))
+        known = self._classical.chain, self._method, self._prepare, self._own
         try:
-            runs = ChainRuns(self._classical, self._method, self._prepare, self._own, self._reporter, given, none)
-            found = runs.cold(options, 0.0).outcome
+            runs = ChainRuns(*known, self._reporter, self._classical.values, none)
+            pairs = zip(options, prepared.meshes, strict=True)
+            found = runs.cold(tuple(with_substeps(own, mesh, mesh.substeps) for own, mesh in pairs), 0.0).outcome
             assert isinstance(found, ChainOutcome)
             return None if self._reporter.stop else around_classical(chain, prepared.meshes, values, found)
         except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved
