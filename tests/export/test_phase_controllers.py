@@ -167,7 +167,10 @@ def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> No
     z = _joined(rise, np.append(J @ end, [0.0, 0.0]), begun, h)
     Phi = np.column_stack([_joined(rise, c, 0, h) for c in np.eye(7)]) - _joined(rise, np.zeros(7), 0, h)[:, None]
     P, M, Q, U = np.zeros((7, 7)), np.eye(5)[:2], np.diag([0.01, 0.02, 0.05, 0.0, 0.0]), np.diag([0.1, 0.2])
-    P[:5, :5] = rise.values["E"][0]
+    F, noise = _slopes(fall, 0.995)[0], np.diag([0.01, 0.02, 0.0, 0.0])
+    unread = expm(0.01 * np.block([[-F, noise], [np.zeros((4, 4)), F.T]]))  # no reading of the last 0.01 s of the fall
+    ended = unread[4:, 4:].T @ fall.at(0.99)["E"] @ unread[4:, 4:] + unread[4:, 4:].T @ unread[:4, 4:]
+    P[:5, :5] = rise.values["E"][0] + J @ (ended - fall.values["E"][-1]) @ J.T
     F = np.zeros((7, 7))
     F[:5, :5], F[5:, :5] = _slopes(rise, h / 2)[0], M  # what noise makes while F is nearly constant
     density = np.block([[Q, np.zeros((5, 2))], [np.zeros((2, 5)), U]])
@@ -509,3 +512,29 @@ def test_phases_none_of_which_measures_anything_have_no_controller() -> None:
     with pytest.raises(co.ExportError, match="the problem measures nothing"):
         export_c(solution["one"], FOLDER / "refused")
     assert not (FOLDER / "refused").exists()
+
+
+def _regulated(duration: float, name: str, *, first: bool = True, last: bool = True) -> co.Problem:
+    p = co.Problem(duration, name=name)
+    x, u = p.state("x", initial=1.0 if first else None, variance=1.0 if first else None), p.control("u")
+    p.dynamics(x, u - 0.2 * x, noise=0.05)
+    p.measurement("place", x, noise=0.05)
+    p.minimize_expected(running=0.5 * u**2 + x**2, terminal=2.0 * x**2 if last else 0.0)
+    return p
+
+
+def test_readings_that_were_missing_count_beyond_the_junction() -> None:
+    """None comes for two seconds, up to where the phases meet: the next one counts as after the gap in one problem."""
+    whole = co.solve(_regulated(4.0, "whole"), intervals=80, progress=False)
+    parts = [_regulated(2.0, "one", last=False), _regulated(2.0, "two", first=False)]
+    cut = co.solve(co.Phases(parts), intervals=40, progress=False)
+    one, other = (export_c(s, FOLDER / f"gap_{s.name or 'parts'}").reference() for s in (whole, cut))
+    for k in range(1, 41):
+        time = 0.1 * k
+        reading = np.nan if k <= 20 else float(whole.at(min(time, 4.0))["x"]) + 0.8
+        known, found = one.step(reading, time), other.step(reading, time)
+        np.testing.assert_allclose(found, known, rtol=1e-4, atol=1e-5, err_msg=f"{time}")
+        np.testing.assert_allclose(other.estimate, one.estimate, rtol=1e-4, atol=1e-5, err_msg=f"{time}")
+        if k == 21:  # E of the gap: E' = 0.05 - 0.4 E from 1; a mean over 0.1 s, whose noise is 0.05/0.1
+            E = 0.125 + 0.875 * np.exp(-0.4 * 2.05)
+            assert float(other.estimate[0]) == pytest.approx(0.8 * E / (E + 0.5), rel=0.02)

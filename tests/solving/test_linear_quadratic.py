@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -143,16 +144,13 @@ def test_a_limit_of_the_spread_is_no_quadratic_program():
 def test_what_is_not_stationary_is_not_taken(monkeypatch: pytest.MonkeyPatch):
     """A nominal that would be wrongly called the optimum is left to the run, which finds it."""
     right = solved(5.0)
-    original = from_classical._around
+    original = from_classical.run_around
 
     def pushed(statement, mesh, found, values):
-        t = found.extremal.trajectory
-        from dataclasses import replace
+        t = found.trajectory
+        return original(statement, mesh, replace(found, trajectory=replace(t, u=t.u + 0.3)), values)
 
-        wrong = replace(found.extremal, trajectory=replace(t, u=t.u + 0.3))
-        return original(statement, mesh, replace(found, extremal=wrong), values)
-
-    monkeypatch.setattr(from_classical, "_around", pushed)
+    monkeypatch.setattr(from_classical, "run_around", pushed)
     found = co.solve(mass(5.0), progress=False)
     assert found.stats["iterations"] > 2
     assert found.cost == pytest.approx(right.cost, rel=1e-7)

@@ -376,9 +376,10 @@ def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nomina
     model = design.model(x, u, t)
     E, (C, designed) = kind.sym("E", n + always, n + always), design.gain(x, u, e, t)
     if r == 0:  # a phase that measures nothing: prediction alone, which the feedback goes on acting on
-        gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C)])
-        C, none = gain(now.x, now.u, now.e, time), ca.MX(0)
-        return _Corrected(ahead.estimate, C, ca.MX(n, 0), pack_symbolic(ahead.spread), none, none)
+        gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C), ca.densify(designed)])
+        C, known = gain(now.x, now.u, now.e, time)
+        apart = ca.sum1(_apart(design, ahead.spread, known)) > 0
+        return _Corrected(ahead.estimate, C, ca.MX(n, 0), pack_symbolic(ahead.spread), ca.MX(0), apart)
     present, read = ca.fabs(measured) <= LARGEST, slice(always, r)
     some = ca.fmax(h, SHORTEST)
     at_end = model.h[read, 0] + model.M[read, :] @ y + model.H[read, :] @ (held - u[:m])
@@ -394,13 +395,17 @@ def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nomina
     left = ca.horzcat(ca.DM.eye(n), kind(n, always)) - L @ rows
     after = left @ E @ left.T + L @ noise @ L.T
     absent = due * (1 - present)
-    apart = ca.fabs(ca.diag(after - designed)) > NEAR * ca.diag(designed) + SLIGHT * ca.DM(design.units) ** 2
-    flags = [ca.sum1(absent) > 0, ca.sum1(apart) > 0]
+    flags = [ca.sum1(absent) > 0, ca.sum1(_apart(design, after, designed)) > 0]
     kept = pack_symbolic(ca.diagcat(after, kind(always, always)))
     L = L @ ca.diag(roots)
     outputs = [ca.densify(v) for v in (y + L @ residual, C, L, kept, *flags)]
     function = ca.Function("correct", [y, seen, E, held, measured, h, due, x, u, e, t], outputs)
     return _Corrected(*function(*ahead, *given, now.x, now.u, now.e, time))
+
+
+def _apart(design: Design, error: Any, designed: Any) -> Any:
+    """Which variances of the error are others than those of the design."""
+    return ca.fabs(ca.diag(error - designed)) > NEAR * ca.diag(designed) + SLIGHT * ca.DM(design.units) ** 2
 
 
 def points(design: Design, tables: History, random: np.random.Generator, count: int) -> Array:

@@ -26,7 +26,7 @@ import numpy as np
 from covocp.base.dataclass import dataclass
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, half_length
+from covocp.base.matrices import Array, half_length, pack_symbolic, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.controller import (
     ABOUT,
@@ -67,7 +67,8 @@ ABOUT_PHASES = (
 class Leg:
     """A phase in a controller.
 
-    part: its name in C. tangent: of the jump at its end, (n of the next one, n); None of the last phase.
+    part: its name in C. tangent: of the jump at its end, (n of the next one, n), and noise: variances that are added
+    there; None of the last phase.
     kept: controls of this phase that the next one has, as (row there, row here). begun: control where it begins.
     """
 
@@ -77,6 +78,7 @@ class Leg:
     part: str
     start: float
     tangent: Array | None
+    noise: Array | None
     kept: tuple[tuple[int, int], ...]
     begun: Array
 
@@ -141,7 +143,7 @@ def legs_of(
     legs = []
     for k, (design, own) in enumerate(zip(designs, tables, strict=True)):
         m = design.sizes[1]
-        tangent, kept = None, []
+        tangent, noise, kept = None, None, []
         if k < len(solution.links):
             later = designs[k + 1]
             names = later.statement.control_names[: later.sizes[1]]
@@ -151,7 +153,7 @@ def legs_of(
             function = solution.links[k].deviations
             assert function is not None
             given = (t.x[-1], t.e[-1], t.duration, solution[k].parameters, solution[k + 1].parameters, none)
-            tangent = np.asarray(function(*given)[0].full())
+            tangent, noise = (np.asarray(value.full()) for value in function(*given)[:2])
         begun = np.clip(own.rows(np.zeros(1))[1][0, :m], *design.limits)
         legs.append(
             Leg(
@@ -161,6 +163,7 @@ def legs_of(
                 part=parts[k],
                 start=float(starts[k]),
                 tangent=tangent,
+                noise=noise,
                 kept=tuple(kept),
                 begun=begun,
             )
@@ -326,6 +329,7 @@ def _crossing(legs: tuple[Leg, ...], begins: ca.Function, room: _Room, k: int) -
     """
     (leg, later), (symbols, given) = legs, _given(legs[0], room)
     assert leg.tangent is not None
+    assert leg.noise is not None
     meets = ca.MX.sym("meets")
     given = given._replace(measured=ca.if_else(meets, given.measured, np.nan))
     found = stepped(leg.design, leg.tables, given, ca.MX(leg.tables.duration), ca.MX(1))
@@ -333,7 +337,11 @@ def _crossing(legs: tuple[Leg, ...], begins: ca.Function, room: _Room, k: int) -
     for row, own in leg.kept:
         control[row] = given.held[own]
     gone = found.fields["length"]
-    entered = {"estimate": ca.DM(leg.tangent) @ found.fields["estimate"], "control": control, "length": gone}
+    J, n = ca.DM(leg.tangent), leg.design.sizes[0]
+    error = unpack_symbolic(found.fields["spread"], n + leg.design.always)[:n, :n]
+    spread = ca.diagcat(J @ error @ J.T + ca.DM(leg.noise), ca.MX(later.design.always, later.design.always))
+    entered = {"estimate": J @ found.fields["estimate"], "control": control, "length": gone}
+    entered |= {"spread": pack_symbolic(spread), "overdue": found.fields["overdue"]}
     start = {name: _padded(entered.get(HELD[name], ca.MX(0)), size) for name, size in room.kept.items()}
     ready = dict(zip(room.fields, begins(*start.values(), 0.0, np.nan, 0.0, 1.0)[1:-3], strict=True))
     on = {**ready, **_fields(later, room, {**entered, "length": -gone})}  # goes on from there
