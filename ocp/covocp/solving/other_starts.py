@@ -199,7 +199,7 @@ class OtherStarts(ClassicalRuns):
         return outcome
 
     def _by_other_steps(self, failed: Outcome, guess: Given, reporter: Progress) -> Outcome:
-        """Solved by Gauss steps where a gain fails that did not start from the best one; else as it failed."""
+        """Solved by Gauss steps where a gain fails whose guess was no solution; else as it failed."""
         if free_gain_block(self._solved) is None:
             return failed
         from covocp.solving.other_ways import by_other_ways

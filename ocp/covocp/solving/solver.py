@@ -370,7 +370,7 @@ class Solver(OtherStarts):
                 break
         if best is not None and self._otherwise and not outcome.converged and not reporter.stop:
             outcome = self._otherwise_solved(outcome, best, guess if isinstance(guess, Solution) else best, reporter)
-        elif not (outcome.converged or reporter.limited or self._counted or best) and self._by_ipopt:
+        elif not (outcome.converged or reporter.limited or self._counted or best or given) and self._by_ipopt:
             outcome = self._by_other_steps(outcome, guess, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
 
