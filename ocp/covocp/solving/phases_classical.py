@@ -33,14 +33,14 @@ from covocp.transcription.mesh import Mesh
 Arrays = tuple[Array, ...]
 
 
-class Deterministic(NamedTuple):
+class DeterministicChain(NamedTuple):
     """The deterministic problem of phases, and its parameters, which are fewer than those of the whole."""
 
     chain: Chain
     values: Arrays
 
 
-def without_noise(phases: Phases, chain: Chain, parameters: Mapping[str, Any]) -> Deterministic | None:
+def without_noise(phases: Phases, chain: Chain, parameters: Mapping[str, Any]) -> DeterministicChain | None:
     """The deterministic problem of phases where it is a quadratic program that has their optimum; None where it is not.
 
     Args:
@@ -55,7 +55,7 @@ def without_noise(phases: Phases, chain: Chain, parameters: Mapping[str, Any]) -
         return None
     try:
         found = with_declarations(phases, [deterministic(phase) for phase in own]).chain()
-        return Deterministic(found, values_of(found, parameters))
+        return DeterministicChain(found, values_of(found, parameters))
     except CovocpError:  # a phase whose cost depends on nothing that can be chosen
         return None
 
@@ -155,9 +155,8 @@ def _along(
     for i, (st, mesh, value) in enumerate(zip(chain.statements, meshes, values, strict=True)):
         if i:
             t = outcomes[-1].extremal.trajectory
-            value = chain.links[i - 1].filled(
-                value, chain.links[i - 1].values(t.x[-1], t.e[-1], t.duration, filled[-1], value)[1]
-            )
+            link = chain.links[i - 1]
+            value = link.filled(value, link.values(t.x[-1], t.e[-1], t.duration, filled[-1], value)[1])
         around = run_around(st, mesh, found.extremals[i], value)
         if around is None:
             return [], []

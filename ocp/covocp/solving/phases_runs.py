@@ -25,7 +25,7 @@ from covocp.solving.failure import with_stalled
 from covocp.solving.from_classical import SOON
 from covocp.solving.longer import longer, may_be_too_short
 from covocp.solving.other_minima import TURNS, unless_it_fails
-from covocp.solving.phases_classical import AroundClassical, Deterministic, around_classical
+from covocp.solving.phases_classical import AroundClassical, DeterministicChain, around_classical
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
 from covocp.solving.refined_meshes import Measured, remade
@@ -78,7 +78,7 @@ class ChainRuns:
         reporter: Progress,
         values: Arrays,
         guesses: list[list[Any]],
-        classical: Deterministic | None = None,
+        classical: DeterministicChain | None = None,
     ) -> None:
         """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed.
 
