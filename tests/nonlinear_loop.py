@@ -45,7 +45,7 @@ def problem(*, noise=1.0, variance=VARIANCE, measurement_noise=MEASUREMENT_NOISE
 
 def rate(x, u):
     r0, r1, c = x
-    return np.array([r1 + 0.3 * np.sin(r0) + 0.2 * u[1], -c * r0 - 0.1 * r1**3 + u[0] * (1 + 0.2 * r0), 0 * r0])
+    return np.array([r1 + 0.3 * np.sin(r0) + 0.2 * u[1], -c * r0 - 0.1 * r1**3 + u[0] * (1 + 0.2 * r0), 0 * (r0 + u[0])])
 
 
 def measured(x, u):
@@ -93,23 +93,21 @@ def process_noise(x, u, factor=1.0):
 
 
 def derivative(function, x):
-    """Jacobian by complex steps, exact to roundoff."""
+    """Jacobian by complex steps, exact to roundoff; `function` is given the steps as columns, all at once."""
     x = np.asarray(x, dtype=float)
-    columns = [np.asarray(function(x + 1j * STEP * e)).imag / STEP for e in np.eye(x.size)]
-    return np.array(columns).T
+    return np.asarray(function(x[:, None] + 1j * STEP * np.eye(x.size))).imag / STEP
+
+
+def weights(x, u):
+    """A, B, N."""
+    curvature = derivative(lambda z: running_slopes(z[:3], z[3:]), np.concatenate([x, u]))
+    return curvature[:3, :3], curvature[3:, 3:], curvature[:3, 3:]
 
 
 def slopes(x, u):
     """F, G, M and A, B, N."""
-    curvature = derivative(lambda z: running_slopes(z[:3], z[3:]), np.concatenate([x, u]))
-    return (
-        derivative(lambda z: rate(z, u), x),
-        derivative(lambda v: rate(x, v), u),
-        derivative(lambda z: measured(z, u), x),
-        curvature[:3, :3],
-        curvature[3:, 3:],
-        curvature[:3, 3:],
-    )
+    F, G = derivative(lambda z: rate(z, u), x), derivative(lambda v: rate(x, v), u)
+    return F, G, derivative(lambda z: measured(z, u), x), *weights(x, u)
 
 
 def system(end, factor=1.0):
@@ -118,12 +116,12 @@ def system(end, factor=1.0):
         start=START,
         variance=VARIANCE,
         rate=rate,
-        F=lambda x, u: slopes(x, u)[0],
-        G=lambda x, u: slopes(x, u)[1],
-        M=lambda x, u: slopes(x, u)[2],
+        F=lambda x, u: derivative(lambda z: rate(z, u), x),
+        G=lambda x, u: derivative(lambda v: rate(x, v), u),
+        M=lambda x, u: derivative(lambda z: measured(z, u), x),
         Q=lambda x, u: process_noise(x, u, factor),
         U=MEASUREMENT_NOISE,
-        weights=lambda x, u: slopes(x, u)[3:],
+        weights=weights,
         end=end,
         running=running,
         terminal=terminal,
