@@ -106,6 +106,12 @@ class Tape:
         self.calls.append(Call(arguments=[first, *given], after=after, forward=forward, slopes=slopes))
         return after[:, every - 1 :: every] if every > 1 else after
 
+    def beside(self) -> Tape:
+        """Another one, whose C code is told with that of this one."""
+        other = Tape(self._form)
+        other._unwritten = self._unwritten
+        return other
+
     def written(self) -> Written:
         """The C code of all of them, in the form that is written."""
         from importlib.resources import files

@@ -21,6 +21,11 @@ from covocp.export.laws.law import CODES, RETURNED, STATUSES, Law, Port, span, s
 from covocp.export.text.header import struct_name
 
 NAMES = tuple(STATUSES)
+# What is done where a solver has no such argument.
+OTHER_DURATION = (
+    "export the problem with the other duration: the plan chooses this one, or something is read or holds at so many "
+    "seconds, depends on the time, or was stated with the number of Problem.duration"
+)
 
 
 class Backend(Protocol):
@@ -279,6 +284,8 @@ class Call:
                 remedy = start if f"initial_{name}" in names else spelling(name, names, f"leave '{name}' out")
                 if name in self.law.instead:
                     remedy = f"only a start depends on '{name}': give {self.law.instead[name]}"
+                elif name == "duration" and self.law.kind == "solver":
+                    remedy = OTHER_DURATION
                 raise self._unfit(f"{name}={value!r}", remedy, what)
             if name in given:
                 raise self._unfit(f"'{name}' by its place and by its name", "give it once")

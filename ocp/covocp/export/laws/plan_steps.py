@@ -1,70 +1,142 @@
 """Whether the steps of an exported solver are short enough for the plan it found: the plan run again by halves of them.
 
-Steps are chosen at the export. A start, a parameter or a duration that makes the plant faster leaves them where they
-are, and the conditions of a minimum then hold for a plant that is none.
+Steps are chosen at the export. A start, a parameter or a duration that makes the plant faster, or its covariances,
+leaves them where they are, and the conditions of a minimum then hold for a plant that is none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Given, sequence_of
+from covocp.base.expressions import Expr, Given, sequence_of
 from covocp.base.matrices import Array
 from covocp.export.laws.law import LARGEST
+from covocp.passage.written import Tape
+from covocp.statement.conditions import Columns, Conditions
+from covocp.statement.interval import Interval
+from covocp.transcription.limit_units import ALONG, row_units
 from covocp.transcription.nlp import NLP
-from covocp.transcription.shooting import interval_columns
+from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import full_interval, nominal_interval
 
-# Change of a state at a node, relative to its range along the plan, and of the cost, above which steps are long.
-NODES, COST = 4e-3, 0.01
+# Change of a state at a node, relative to its range along the plan, of the cost, and of what conditions on covariances
+# compare, in units of their limits, above which steps are long.
+NODES, COST, ROWS = 4e-3, 0.01, 0.01
 # So many times what steps are off at the export itself, which was told there, is allowed where that is more.
 AS_AT_EXPORT = 3.0
 # Range of what hardly varies, in its unit.
 LEAST_RANGE = 1e-3
-# Entries of matrices up to which their own cost on the way is taken by shorter steps too: those of six rows.
-MOST_ENTRIES = 21
 
 
-def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given) -> Any:
-    """What halving the steps changes of a plan: of the states at the nodes, and of the cost, relative, (2, 1).
+def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, tape: Tape | None = None) -> Any:
+    """What halving the steps changes of a plan: of the states, of the cost, of conditions on covariances, (3, 1).
 
     States count by what all intervals by themselves are off, together, or by one run along the controls where that is
-    less: what a plant forgets is no error, and what an unstable one makes of an error is none of the steps.
+    less: what a plant forgets is no error, and what an unstable one makes of an error is none of the steps. Covariances
+    pass once along all nodes of the plan.
 
     Args:
         nlp: the transcription.
         p: parameters of the statement.
         evaluated: states, half-vectors, controls at the nodes, duration, running and terminal cost of the plan.
         held: multipliers of final states that are prescribed, (nx, 1): what it costs to miss them.
+        tape: takes the passages, as that of the transcription; None: they are CasADi's operations.
     """
     st, mesh = nlp.statement, nlp.mesh
-    if st.coupled or st.nominal is None or not st.nx:
-        return ca.MX(ca.DM([0.0, 0.0]))
+    if not st.nx or (st.nominal is None and not st.coupled):
+        return ca.MX(ca.DM.zeros(3, 1))
     x, e, u, duration, running, terminal = evaluated[:6]
     common = interval_columns(mesh, u, duration, p)
-    finer = nominal_interval(st, 2 * mesh.substeps, mesh.step)
-    ends, _, costs = finer.map(mesh.intervals)(x[:, :-1], *common)
-    along = sequence_of(finer, mesh.intervals)(x[:, 0], *common)[0] - x[:, 1:]
-    off = ca.sum2(ca.fabs(ends - x[:, 1:]))
-    run = ca.vertcat(*[ca.mmax(ca.fabs(along[i, :])) for i in range(st.nx)])
-    moved = ca.fmin(off, run)
-    ranges = ca.vertcat(*[ca.mmax(x[i, :]) - ca.mmin(x[i, :]) for i in range(st.nx)])
-    nodes = moved / ca.fmax(ranges, LEAST_RANGE * ca.DM(nlp.scales.x))
-    last = along[:, -1] * ca.fmin(1.0, off / ca.fmax(run, np.finfo(float).tiny))
-    change = st.terminal(x[:, -1] + last, e[:, -1], duration, p) - terminal
-    own = st.matrices and not st.behind and st.samples is None and st.ne <= MOST_ENTRIES
-    if not st.running_uses_matrices:
-        change += ca.sum2(costs) - running
-    elif own:
-        whole = full_interval(st, 2 * mesh.substeps, mesh.step, mesh.linear_solver).map(mesh.intervals)
-        change += ca.sum2(whole(ca.vertcat(x, e)[:, :-1], *common)[2]) - running
-    change = ca.fmax(ca.fabs(change), ca.fabs(change - ca.dot(held, last)))
+    if st.coupled:
+        finer = full_interval(st, 2 * mesh.substeps, mesh.step, mesh.linear_solver)
+    else:
+        finer = nominal_interval(st, 2 * mesh.substeps, mesh.step)
+    nodes = ca.vertcat(x, e) if st.coupled else x
+    scales = np.concatenate([nlp.scales.x, nlp.scales.e]) if st.coupled else nlp.scales.x
+    ends, fine, costs = finer.map(mesh.intervals)(nodes[:, :-1], *common)
+    along = sequence_of(finer, mesh.intervals)(nodes[:, 0], *common)[0] - nodes[:, 1:]
+    off = ca.sum2(ca.fabs(ends - nodes[:, 1:]))
+    run = ca.vertcat(*[ca.mmax(ca.fabs(along[i, :])) for i in range(nodes.shape[0])])
+    ranges = ca.vertcat(*[ca.mmax(nodes[i, :]) - ca.mmin(nodes[i, :]) for i in range(nodes.shape[0])])
+    moved = ca.fmin(off, run) / ca.fmax(ranges, LEAST_RANGE * ca.DM(scales))
+    taken = ca.fmin(1.0, off / ca.fmax(run, np.finfo(float).tiny))  # of what one run is off
+    last = along[:, -1] * taken
+    if st.coupled:
+        passed = ca.horzcat(e[:, 0], e[:, 1:] + (along * ca.repmat(taken, 1, mesh.intervals))[st.nx :, :])
+    elif st.matrices:
+        passed, paid = _passed(nlp, (x, e, fine, common, p), tape)
+        costs = costs + paid
+    else:
+        passed = e
+    change = st.terminal(x[:, -1] + last[: st.nx], passed[:, -1], duration, p) - terminal + ca.sum2(costs) - running
+    change = ca.fmax(ca.fabs(change), ca.fabs(change - ca.dot(held, last[: st.nx])))
     size = ca.fmax(ca.fabs(running + terminal), np.finfo(float).tiny)
-    return ca.vertcat(ca.mmax(ca.vertcat(0.0, nodes)), change / size)
+    rows = _rows(nlp, (x, u, duration, p), (e, passed)) if st.matrices else ca.MX(0.0)
+    return ca.vertcat(ca.mmax(ca.vertcat(0.0, moved)), change / size, rows)
+
+
+def _passed(nlp: NLP, along: tuple[Any, ...], tape: Tape | None) -> tuple[Any, Any]:
+    """Half-vectors at the nodes and running costs of the intervals by steps of half the length."""
+    x, e, fine, common, p = along
+    finer = replace(nlp.mesh, substeps=2 * nlp.mesh.substeps)
+    given = (nlp.statement, finer, x, fine, Interval(*common), p, e[:, 0])
+    if tape is None:
+        return matrices_along(*given)
+    own = tape.beside()
+    found: list[Any] = list(matrices_along(*given, passage=own.passed_by))
+    symbols: list[Any] = []
+    values: list[Any] = []
+    for call in own.calls:
+        arguments = ca.substitute(list(call.arguments), symbols, values) if symbols else call.arguments
+        after = call.forward(*(ca.densify(argument) for argument in arguments))[: call.after.numel()]
+        symbols.append(call.after)
+        values.append(ca.reshape(after, *call.after.shape))
+    return tuple(ca.substitute(found, symbols, values))
+
+
+def _rows(nlp: NLP, along: tuple[Any, ...], matrices: tuple[Any, Any]) -> Any:
+    """By how much other matrices change what conditions compare, in units of their limits, where these are near."""
+    st = nlp.statement
+    changes = [ca.MX(0.0)]
+    for conditions, at, shares in _conditions(nlp):
+        if conditions.uses_matrices:
+            units = ca.DM(row_units(st, conditions, nlp.scales, shares))
+            told, found = (_compared(nlp, conditions, at, along, e) for e in matrices)
+            lower, upper = (ca.repmat(ca.DM(v), 1, len(at)) for v in (conditions.lower, conditions.upper))
+            unit = ca.repmat(units, 1, len(at))
+            near = ca.fmax(*(ca.fmax(lower - value, value - upper) for value in (told, found))) > -ROWS * unit
+            changes.append(ca.mmax(ca.if_else(near, ca.fabs(found - told) / unit, 0.0)))
+    known = np.flatnonzero(~np.isnan(st.boundary_values(st.values)[3])).tolist()
+    if known:
+        told, found = (e[known, -1] for e in matrices)
+        least = LEAST_RANGE * ca.DM(nlp.scales.e[known])
+        changes.append(ca.mmax(ca.fabs(found - told) / ca.fmax(ca.fabs(told), least)))
+    return ca.mmax(ca.vertcat(*changes))
+
+
+def _conditions(nlp: NLP) -> Iterator[tuple[Conditions, list[int], tuple[float, ...]]]:
+    """All conditions, the nodes at which they hold, and where on the horizon these are."""
+    st, last = nlp.statement, nlp.mesh.intervals
+    yield st.path, list(range(last + 1)), ALONG
+    yield st.start, [0], (0.0,)
+    yield st.end, [last], (1.0,)
+    for part, node in zip(st.inside.parts, st.inside.nodes_among(nlp.mesh.nodes), strict=True):
+        yield part.conditions, [node], (part.place,)
+
+
+def _compared(nlp: NLP, conditions: Conditions, at: list[int], along: tuple[Any, ...], e: Expr) -> Any:
+    """What the rows of conditions are at some nodes."""
+    x, u, duration, p = along
+    if nlp.statement.nu and nlp.mesh.control != "linear":
+        u = ca.horzcat(u, u[:, -1])
+    controls = u if nlp.statement.nu else ca.MX(0, nlp.mesh.intervals + 1)
+    time = duration * ca.DM(nlp.mesh.nodes).T
+    return conditions.columns(Columns(*(v[:, at] for v in (x, controls, e, time))), duration, p)
 
 
 def final_multipliers(nlp: NLP, of_bounds: Given, scale: float) -> Any:
@@ -80,10 +152,12 @@ def limits(nlp: NLP, w: Array, of_bounds: Array, scale: float) -> Array:
     evaluated: Any = nlp.evaluate(variables, ca.vertcat(p, 1.0))
     found = ca.Function("told", [variables, p], [changes_by_halves(nlp, p, evaluated, held)])(w, nlp.statement.values)
     own = np.fmin(np.asarray(found.full()).ravel(), LARGEST)  # where that is no number anything that is one is allowed
-    return np.asarray(np.maximum([NODES, COST], AS_AT_EXPORT * own))
+    return np.asarray(np.maximum([NODES, COST, ROWS], AS_AT_EXPORT * own))
 
 
-def are_long(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, most: Array) -> Any:
+def are_long(
+    nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, most: Array, tape: Tape | None = None
+) -> Any:
     """Whether halving the steps changes more than that; so it does where the run by halves has no end."""
-    told = changes_by_halves(nlp, p, evaluated, held)
-    return ca.logic_not(ca.logic_and(told[0] <= float(most[0]), told[1] <= float(most[1])))
+    told = changes_by_halves(nlp, p, evaluated, held, tape)
+    return ca.logic_not(ca.mmin(told <= ca.DM(most)))

@@ -78,9 +78,9 @@ def replannable(problem: Problem) -> Replannable:
     """The problem with parameters for all that may change between two plans.
 
     Fixed initial values of states become "initial_<state>", initial matrices "initial_<matrix>" (that of the estimation
-    covariance too), a fixed duration "duration", unless something depends on the time explicitly. Free initial values,
-    a free duration and decisions are chosen anew by each plan. Parameters that only such a start depends on are no
-    arguments: in C every argument is given, so the start is, and they would do nothing.
+    covariance too), a fixed duration "duration", unless another one would be another problem (`_movable`). Free initial
+    values, a free duration and decisions are chosen anew by each plan. Parameters that only such a start depends on are
+    no arguments: in C every argument is given, so the start is, and they would do nothing.
     """
     statement, own = problem.statement(), problem.declarations
     if own.sampled:
@@ -108,7 +108,7 @@ def replannable(problem: Problem) -> Replannable:
         port = Port(name=name, rows=rows, columns=columns, unit=block.unit, about=about)
         entries.append(Argument(port=port, parameter=block.name, value=value, deviation=0.02 * np.abs(value)))
     moving = own
-    if own.free_duration is None and statement.autonomous and not _timed(own):
+    if statement.autonomous and _movable(own, read=problem.duration_read):
         T = float(own.duration)
         free = Free(T, DURATIONS[0] * T, DURATIONS[1] * T)
         moving = replace(own, free_duration=free, duration=ca.MX.sym("duration"))
@@ -146,11 +146,17 @@ def _follows(start: Start, entry: Parameter) -> bool:
     return start.of.initial is not None and ca.depends_on(ca.MX(start.of.initial), entry.symbol)
 
 
-def _timed(problem: Declarations) -> bool:
-    """Whether a constraint or a measurement contains the time."""
+def _movable(problem: Declarations, *, read: bool) -> bool:
+    """Whether a fixed duration of an autonomous problem may be another one, and all else stays what was declared.
+
+    Not where a constraint or a measurement contains the time, where a condition holds at so many seconds, or where the
+    number of the duration was read (`read`) and may be in the expressions.
+    """
     expressions = [c.expression for c in problem.constraints]
     expressions += [value for m in problem.measurements for value in (m.expression, m.noise)]
-    return any(ca.depends_on(expression, problem.time) for expression in expressions)
+    timed = any(ca.depends_on(expression, problem.time) for expression in expressions)
+    held = any(c.instant is not None and not c.relative for c in problem.constraints)
+    return problem.free_duration is None and not (timed or held or read)
 
 
 def _argument(start: Start, taken: set[str], parameters: tuple[Parameter, ...]) -> Argument:

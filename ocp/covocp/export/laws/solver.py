@@ -299,8 +299,8 @@ class _Core:
     __repr__ = short_repr
 
 
-def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core:
-    """The function for these settings, on one form of the transcription."""
+def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any], tape: Tape | None = None) -> _Core:
+    """The function for these settings, on one form of the transcription; `tape`: as of `changes_by_halves`."""
     entries = task.made.entries
     try:
         parts = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
@@ -334,7 +334,7 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
     outputs = _results(task, result["x"], evaluated, (violation, left))
     bad = ca.logic_not(ca.logic_and(violation <= INFEASIBLE, left <= STATIONARY))
     held = final_multipliers(nlp, result["lam_x"], task.scale)
-    long, uncertain = are_long(nlp, p, evaluated, held, task.steps), coarse(nlp, p, evaluated)
+    long, uncertain = are_long(nlp, p, evaluated, held, task.steps, tape), coarse(nlp, p, evaluated)
     long = long if uncertain is None else ca.logic_or(long, uncertain)
     good = ca.if_else(long, CODES["COARSE"], CODES["OK"])
     values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], good)]
@@ -345,10 +345,10 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
 def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     """The law for these settings."""
     nlp, entries = task.nlp, task.made.entries
-    made = _core(task, nlp, method, settings)
+    made = _core(task, nlp, method, settings, None if task.written is None else Tape("evaluated"))
     core, code, plain = made.function, None, None
     if task.written is not None:
-        code = _core(task, task.written[0], method, settings).function
+        code = _core(task, task.written[0], method, settings, task.written[1]).function
 
         def plain() -> ca.Function:
             return _core(task, transcribe(nlp.statement, nlp.mesh, nlp.scales), method, settings).function

@@ -150,12 +150,12 @@ def _renamed(function: ca.Function, name: str) -> ca.Function:
 
 
 def _filled(source: str, bodies: Mapping[str, str]) -> str:
-    """The code with other bodies of some functions."""
+    """The code with other bodies of some functions; those that nothing calls, CasADi has not written."""
     for name, body in bodies.items():
         place = re.compile(rf"(^/\* {name}:\(.*\*/\nstatic int .* \{{\n)(?:.*\n)*?(\}}\n)", re.MULTILINE)
         found = place.search(source)
-        assert found is not None
-        source = source[: found.end(1)] + body + source[found.start(2) :]
+        if found is not None:
+            source = source[: found.end(1)] + body + source[found.start(2) :]
     return source
 
 
