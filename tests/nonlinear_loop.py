@@ -45,7 +45,9 @@ def problem(*, noise=1.0, variance=VARIANCE, measurement_noise=MEASUREMENT_NOISE
 
 def rate(x, u):
     r0, r1, c = x
-    return np.array([r1 + 0.3 * np.sin(r0) + 0.2 * u[1], -c * r0 - 0.1 * r1**3 + u[0] * (1 + 0.2 * r0), 0 * (r0 + u[0])])
+    return np.array(
+        [r1 + 0.3 * np.sin(r0) + 0.2 * u[1], -c * r0 - 0.1 * r1**3 + u[0] * (1 + 0.2 * r0), 0 * (r0 + u[0])]
+    )
 
 
 def measured(x, u):

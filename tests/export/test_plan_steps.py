@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import casadi as ca
@@ -87,3 +88,137 @@ def lag_solver(tmp_path_factory):
 def test_a_faster_lag_and_a_longer_time(lag_solver, given: dict[str, float], status: str) -> None:
     """Found by scipy to cost 57.2 for 46.5, and 23.5 for 2.31."""
     assert lag_solver.solve(**given)["status"] == status
+
+
+LIMIT = 0.08
+WEIGHTS = {
+    "terminal": (0.0, 10.0),
+    "running": (1.0, 0.0),
+    "condition": (0.0, 0.0),
+}  # of the variance, on the way and at the end
+
+
+def oscillator(*, term: str, frequency: float = 1.0) -> co.Problem:
+    """A sensor on a carriage sees an oscillator better the farther it is away; the nominal of this one rests."""
+    ocp = co.Problem(duration=10.0, name="oscillator")
+    s = ocp.state("s", initial=0.0, final=0.0)
+    q, v = ocp.state("q", initial=0.0, variance=1.0), ocp.state("v", initial=0.0, variance=1.0)
+    w, u = ocp.parameter("w", frequency), ocp.control("u")
+    ocp.dynamics(s, u)
+    ocp.dynamics(q, v)
+    ocp.dynamics(v, -(w**2) * q - 0.1 * v, noise=0.1)
+    ocp.measurement("place", q * s, noise=0.1)
+    E = ocp.estimation_covariance()
+    if term == "condition":
+        ocp.subject_to(E[q, q], at="final", upper=LIMIT)
+    weights = WEIGHTS[term]
+    ocp.minimize(running=0.5 * u**2 + weights[0] * E[q, q], terminal=weights[1] * E[q, q])
+    return ocp
+
+
+def cost_and_variance(plan: dict[str, Any], w: float, term: str) -> tuple[float, float]:
+    """Of the oscillator along the controls of a plan, and the variance of its place at the end."""
+    t, u = plan["time"], np.ravel(plan["u"])
+    F = np.array([[0.0, 1.0], [-(w**2), -0.1]])
+
+    def rate(q: float, z: Any) -> Any:
+        E, force, M = z[1:5].reshape(2, 2), np.interp(q, t, u), np.array([[z[0], 0.0]])
+        change = F @ E + E @ F.T + np.diag([0.0, 0.1]) - E @ M.T @ M @ E / 0.1
+        return np.array([force, *change.ravel(), 0.5 * force**2 + WEIGHTS[term][0] * E[0, 0]])
+
+    z = np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
+    for a, b in itertools.pairwise(t):
+        z = solve_ivp(rate, (a, b), z, method="DOP853", rtol=1e-8, atol=1e-10).y[:, -1]
+    return float(z[5] + WEIGHTS[term][1] * z[1]), float(z[1])
+
+
+@pytest.mark.parametrize(("term", "fast"), [("terminal", 15.0), ("running", 15.0), ("condition", 6.0)])
+def test_covariances_that_are_fast_beside_a_nominal_at_rest_are_seen(tmp_path, term: str, fast: float) -> None:
+    """Of the nominal all steps are short enough: it rests."""
+    made = co.export_c(oscillator(term=term), tmp_path / "oscillator", intervals=40).reference()
+    for w, status in ((1.0, "OK"), (2.0, "OK"), (fast, "COARSE")):
+        plan = made.solve(w=w)
+        cost, variance = cost_and_variance(plan, w, term)
+        off = abs(plan["cost"] / cost - 1.0)
+        missed = abs(variance / LIMIT - 1.0) if term == "condition" else 0.0  # of the limit, which is reached
+        assert plan["status"] == status
+        assert max(off, missed) < 0.01 if status == "OK" else max(off, missed) > 0.01
+
+
+def coupled(rate: float = 1.0) -> co.Problem:
+    """A nominal that a matrix moves: S tends to 1 + s with a rate, s with the frequency of that rate."""
+    ocp = co.Problem(duration=2.0, name="coupled")
+    x, u, S = ocp.state("x", initial=1.0), ocp.control("u"), ocp.symmetric("S", 2, initial=np.eye(2))
+    k = ocp.parameter("k", rate)
+    ocp.dynamics(x, u - 0.2 * S[0, 0] * x)
+    ocp.dynamics(S, ca.blockcat([[k * S[0, 1], k * (1 - S[0, 0])], [k * (1 - S[0, 0]), -S[1, 1]]]))
+    ocp.minimize(running=0.5 * u**2, terminal=x**2 + S[0, 1] ** 2 + S[0, 0])
+    return ocp
+
+
+@pytest.mark.parametrize("initial", [1.0, 3.0])
+def test_matrices_that_move_the_nominal_are_run_with_it(tmp_path, initial: float) -> None:
+    """S oscillates about 1: S00 = 1 + (S00(0) - 1) cos kt, S01 = -(S00(0) - 1) sin kt."""
+    made = co.export_c(coupled(), tmp_path / "coupled", intervals=10).reference()
+    for k in (1.0, 3.0, 20.0):
+        plan = made.solve(k=k, initial_S=np.diag([initial, 1.0]))
+        t, u = plan["time"], np.ravel(plan["u"])
+
+        def rate(q: float, z: Any, k=k, t=t, u=u) -> list[float]:
+            force = np.interp(q, t, u)
+            return [force - 0.2 * (1 + (initial - 1) * np.cos(k * q)) * z[0], 0.5 * force**2]
+
+        z = np.array([1.0, 0.0])
+        for a, b in itertools.pairwise(t):
+            z = solve_ivp(rate, (a, b), z, rtol=1e-9, atol=1e-11).y[:, -1]
+        end = (initial - 1) * np.array([np.cos(2 * k), -np.sin(2 * k)])
+        cost = float(z[1] + z[0] ** 2 + end[1] ** 2 + 1 + end[0])
+        off = abs(plan["cost"] / cost - 1.0)
+        assert plan["status"] in (("OK",) if k < 10 or initial == 1.0 else ("COARSE", "NOT_CONVERGED"))
+        assert off < 0.01 if plan["status"] == "OK" else off > 0.01
+
+
+def gate(duration: float) -> co.Problem:
+    """It is at a place after a second."""
+    ocp = co.Problem(duration, "gate")
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.subject_to(x, at=1.0, equals=0.8, name="gate")
+    ocp.minimize(running=0.5 * u**2)
+    return ocp
+
+
+def mean(duration: float) -> co.Problem:
+    """Its cost is a mean over the time."""
+    ocp = co.Problem(duration, "mean")
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=(0.5 * u**2 + x**2) / ocp.duration)
+    return ocp
+
+
+@pytest.mark.parametrize("make", [gate, mean])
+def test_no_other_duration_is_taken_where_that_is_another_problem(tmp_path, make: Any) -> None:
+    """It would be half a second or two for the gate, and a mean over the time of the export."""
+    made = co.export_c(make(2.0), tmp_path / "made", intervals=10).reference()
+    assert made.solve()["status"] == "OK"
+    with pytest.raises(co.ExportError, match="the other duration"):
+        made.solve(duration=4.0)
+    with pytest.raises(co.ProblemError, match="duration"):
+        co.Solver(make(2.0), intervals=10).solve(duration=4.0, progress=False)
+
+
+def test_what_follows_something_in_time_is_exported(tmp_path) -> None:
+    """Its covariance hangs on nothing that is planned: CasADi writes no slopes of it."""
+    ocp = co.Problem(5.0, "tracking")
+    x, v = ocp.state("x", initial=0.0, variance=0.1), ocp.state("v", initial=0.0, variance=0.1)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.5 * x, noise=0.1)
+    ocp.measurement("place", x, noise=0.05)
+    ocp.minimize_expected(running=0.5 * u**2 + (x - ca.sin(ocp.time)) ** 2)
+    plan = quick(co.export_c(ocp, tmp_path / "tracking", intervals=20)).python().solve()
+    assert plan["status"] == "OK"
+    assert plan["cost"] == pytest.approx(co.solve(ocp, intervals=20, progress=False).cost, rel=1e-7)

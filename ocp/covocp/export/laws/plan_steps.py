@@ -155,9 +155,7 @@ def limits(nlp: NLP, w: Array, of_bounds: Array, scale: float) -> Array:
     return np.asarray(np.maximum([NODES, COST, ROWS], AS_AT_EXPORT * own))
 
 
-def are_long(
-    nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, most: Array, tape: Tape | None = None
-) -> Any:
+def are_long(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, most: Array, tape: Tape | None = None) -> Any:
     """Whether halving the steps changes more than that; so it does where the run by halves has no end."""
     told = changes_by_halves(nlp, p, evaluated, held, tape)
     return ca.logic_not(ca.mmin(told <= ca.DM(most)))
