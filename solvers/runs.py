@@ -294,10 +294,12 @@ class Runs:
         except RuntimeError:  # a solve inside the model that gives up: the last iterate is lost, the start is not
             w, lam_x, lam_g, where = w0, 0.0 * lam_x, 0.0 * lam_g, nlp.unpack(w0, parameters)
             success, status, evaluable = False, NOT_EVALUABLE.format(status), False
+        with np.errstate(over="ignore"):  # of iterates that left all numbers
+            lam_x, lam_g = scale * lam_x, scale * lam_g
         return Point(
             w=w,
-            lam_x=scale * lam_x,
-            lam_g=scale * lam_g,
+            lam_x=lam_x,
+            lam_g=lam_g,
             where=where,
             success=success,
             status=status,

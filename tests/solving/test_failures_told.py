@@ -220,3 +220,22 @@ def test_what_controls_or_the_duration_may_still_change_is_not_given(row, given)
         extremal=solution.extremal, cost_terms={}, converged=False, message="", violations={row: 1.0}, stats={}
     )
     assert bool(passed_at_the_start(outcome)) is given
+
+
+def test_intervals_in_which_what_grows_leaves_all_numbers_are_the_reason():
+    """x' = x + u for 4000 s: 40 s to an interval, in which x grows by exp(40). With as many as are named it is solved.
+
+    Truth by the Riccati equations in the steady state: E W = p, S = s, of W the information, at the rate S K U K'.
+    """
+    ocp = co.Problem(4000.0, "long")
+    x, u = ocp.state("x", initial=1.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, x + u, noise=0.1)
+    ocp.measurement("place", x, noise=0.1)
+    ocp.minimize_expected(running=x**2 + u**2)
+    with pytest.raises(co.SolveError, match=r"exp\(40\) times larger after an interval.* give intervals=521"):
+        co.solve(ocp, progress=False, max_iterations=5)
+    E = 0.1 * (1 + np.sqrt(2))  # 2 E + 0.1 = E^2 / 0.1
+    S = 1 + np.sqrt(2)  # of x^2 + u^2: 2 S + 1 = S^2
+    rate = E + S * E**2 / 0.1  # tr A E + tr S K U K' with weights of one
+    found = co.solve(ocp, intervals=521, progress=False)
+    assert found.cost == pytest.approx(4000.0 * rate, rel=1e-3)

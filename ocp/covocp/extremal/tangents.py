@@ -164,6 +164,7 @@ def _growth(A: Array) -> float:
     return largest if np.isfinite(largest) else np.inf
 
 
+@np.errstate(over="ignore", invalid="ignore")  # where what grows has no number
 def _regulator(
     A: Array, before: Array, after: Array | None, free: NDArray[np.bool_], scales: tuple[Array, Array]
 ) -> Array:

@@ -12,8 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
+from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.solution.report import OTHERWISE
@@ -22,9 +25,13 @@ from covocp.solving.from_best_gain import part
 from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.stiffness import stiffness
 
 # Iterations with other steps: what finds a way by them mostly takes fewer, and each takes long.
 MOST_ITERATIONS = 150
+# Logarithm of what grows in an interval above which its length is the likely reason of a failure, and what is borne well:
+# a double integrator with a spring that pushes, over 400 to 2000 of its time constants.
+MOST_GROWN, GROWN = 15.0, 8.0
 STEPS: dict[str, Any] = {"covariance_step": "gauss"}
 HESSIAN: dict[str, Any] = {"hessian": "limited-memory"}
 STEPS_IN_WORDS = "covariance_step='gauss'"
@@ -110,6 +117,27 @@ def other_covariances(statement: Statement, options: Options, mesh: Mesh) -> str
         return ""
     other = "states" if mesh.eliminated else "eliminated"
     return f"\n  covariances='{other}' may find a way: this run took '{'eliminated' if mesh.eliminated else 'states'}'."
+
+
+def long_intervals(statement: Statement, options: Options, parameters: Array) -> str:
+    """A line for a run that failed where what grows does so beyond all numbers in an interval; "" where nothing does.
+
+    Args:
+        statement: the problem.
+        options: of the mesh.
+        parameters: values (np,).
+    """
+    try:
+        growing = stiffness(statement, options, parameters).growing
+    except CovocpError:  # where it starts there is no rate
+        return ""
+    if not MOST_GROWN < growing < np.inf:
+        return ""
+    count = int(np.ceil((options.nodes().size - 1) * growing / GROWN))
+    return (
+        f"\n  What grows fastest at the start is exp({growing:.0f}) times larger after an interval, more than numbers "
+        f"can tell: give intervals={count} or more."
+    )
 
 
 def told_ways(tried: str, left: Iterable[Way]) -> str:

@@ -486,8 +486,10 @@ class Solver(OtherStarts):
     def _other_way(self, failed: Outcome, best: Solution | None) -> str:
         """A line for a run that failed, where another method or other options are known to be more robust."""
         from covocp.solution.report import OTHERWISE
-        from covocp.solving.other_ways import other_covariances, told_ways
+        from covocp.solving.other_ways import long_intervals, other_covariances, told_ways
 
+        if grown := long_intervals(self._solved, self._options, self._values):
+            return grown
         if not self._by_ipopt or beyond(self._problem.declarations, best):
             return ""
         if self.method == "ipopt" and is_suited(self._solved, self._prepared.mesh):

@@ -261,6 +261,7 @@ def told_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array) 
 
 
 @lru_cache(maxsize=2)
+@np.errstate(over="ignore", invalid="ignore")  # a run that leaves all numbers is none
 def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held | None:
     """A run that a feedback holds near what is guessed of the states, or from the start to where ends and cost want it.
 
