@@ -43,6 +43,10 @@ LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
 # Rows of a covariance up to which nobody waits for CasADi's own operations.
 LARGEST_UNTOLD = 8
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
+# Weight of violations where Ipopt decides whether a step must make the cost less (1 by default). Near an optimum
+# violations are rounding: a step that lessens them is taken then at any cost, and one of a Hessian that is learnt may
+# cost a hundredth. A slew was left so for a thousand iterations from where it needs ten more.
+NO_BARGAIN = 1e-15
 JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
 
 # Covariances of a closed loop start where they were simulated, some close to their bound of zero, which they never
@@ -185,6 +189,8 @@ def _made_ready(
                 settings["ipopt"]["bound_relax_factor"] = 0.0
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
+            if eliminated:
+                settings["ipopt"]["delta"] = NO_BARGAIN
     if compile:
         settings |= JIT
         meshes = tuple(replace(mesh, linear_solver=COMPILED_SOLVER) for mesh in meshes)

@@ -144,7 +144,8 @@ def cost_of_decay(times: np.ndarray, controls: np.ndarray) -> tuple[float, float
     return float(found[11] + 85.0 * found[10]), float(found[0])
 
 
-@pytest.mark.filterwarnings("ignore:The integration steps are long")  # y grows e^12-fold there, and its variance
+# y grows e^12-fold there, and its variance
+@pytest.mark.filterwarnings("ignore:The integration steps are long", "ignore:What the steps are off grows")
 @pytest.mark.parametrize("intervals", [30, 60, 100])
 def test_the_side_that_tells_more_is_found_from_a_small_control_on_the_other(intervals: int) -> None:
     """Full speed there and back is far from the controls of the dear minimum, and costs a fifth of it."""
