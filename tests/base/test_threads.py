@@ -65,7 +65,7 @@ cheap = {"intervals": 4, "progress": False, "max_iterations": 3, "allow_failure"
 reference = co.solve(common, "gradient", **cheap).cost
 def work(i):
     assert co.solve(common, "gradient", **cheap).cost == reference
-in_threads(work, COUNT // 4)
+in_threads(work, max(2, COUNT // 4))
 """,
     "plugins and files": """
 def work(i):
@@ -75,7 +75,7 @@ def work(i):
         assert co.load(solution.save(folder + "/one.npz")).cost == solution.cost
     found = co.solve(common, plugin="sqpmethod", **MESH)
     assert abs(found.cost - expected[0]) < 1e-5 * expected[0]
-in_threads(work, COUNT // 4)
+in_threads(work, max(2, COUNT // 4))
 """,
     "a law that solves, on an executor of threads": """
 linear = co.Problem(1.0)
@@ -102,7 +102,7 @@ def check(ways, count):
 
 
 def test_threads_agree_and_end():
-    check(WAYS.values(), 8)
+    check(WAYS.values(), 4)
 
 
 @pytest.mark.slow

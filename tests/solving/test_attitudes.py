@@ -233,3 +233,21 @@ def test_a_goal_by_a_decision():
     ocp.attitude("attitude", initial=np.eye(3), final=so3.exp(ca.vertcat(s, 0, 0)), rate=omega)
     ocp.minimize(running=ca.sumsqr(omega), terminal=-s)
     assert co.solve(ocp, intervals=10)["s"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_slew_whose_gyroscope_is_biased_is_solved_near_its_optimum():
+    """An expected cost with limited torques: steps that lessen violations of rounding at any cost left it, for ever."""
+    T, goal, inertia = 20.0, so3.exp([-1.2, 0.3, 0.4]), np.array([12.0, 15.0, 9.0])
+    ocp = co.Problem(T, "biased gyroscope")
+    omega = ocp.state("omega", 3, initial=0.0, variance=1e-4)
+    torque = ocp.control("torque", 3, lower=-0.4, upper=0.4)
+    attitude = ocp.attitude("attitude", initial=np.eye(3), rate=omega, variance=1e-3 * np.eye(3), noise=1e-6 * np.eye(3))
+    bias = ocp.unknown("bias", mean=0.0, variance=1e-3)
+    ocp.dynamics(omega, (torque - ca.cross(omega, inertia * omega)) / inertia, noise=1e-6)
+    ocp.measurement("gyroscope", omega[0] + bias, noise=1e-5)
+    ocp.measurement("star", attitude.matrix @ ca.DM([0.0, 0.6, 0.8]), noise=1e-3)
+    apart = ca.sumsqr(attitude.error(goal)) + ca.sumsqr(omega)
+    ocp.minimize_expected(running=0.5 * ca.sumsqr(torque), terminal=50 * apart)
+    found, other = (unassessed(ocp, method, intervals=40) for method in ("ipopt", "reduced"))
+    assert found.stats["iterations"] < 200
+    assert found.cost == pytest.approx(other.cost, rel=1e-8)
