@@ -241,7 +241,8 @@ def test_a_slew_whose_gyroscope_is_biased_is_solved_near_its_optimum():
     ocp = co.Problem(T, "biased gyroscope")
     omega = ocp.state("omega", 3, initial=0.0, variance=1e-4)
     torque = ocp.control("torque", 3, lower=-0.4, upper=0.4)
-    attitude = ocp.attitude("attitude", initial=np.eye(3), rate=omega, variance=1e-3 * np.eye(3), noise=1e-6 * np.eye(3))
+    known = {"variance": 1e-3 * np.eye(3), "noise": 1e-6 * np.eye(3)}
+    attitude = ocp.attitude("attitude", initial=np.eye(3), rate=omega, **known)
     bias = ocp.unknown("bias", mean=0.0, variance=1e-3)
     ocp.dynamics(omega, (torque - ca.cross(omega, inertia * omega)) / inertia, noise=1e-6)
     ocp.measurement("gyroscope", omega[0] + bias, noise=1e-5)
