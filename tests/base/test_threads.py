@@ -108,4 +108,4 @@ def test_threads_agree_and_end():
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_many_calls_in_threads_agree_and_end(way):
-    check([WAYS[way]], 40)
+    check([WAYS[way]], 16)
