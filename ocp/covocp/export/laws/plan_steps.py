@@ -76,7 +76,10 @@ def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given,
     change = st.terminal(x[:, -1] + last[: st.nx], passed[:, -1], duration, p) - terminal + ca.sum2(costs) - running
     change = ca.fmax(ca.fabs(change), ca.fabs(change - ca.dot(held, last[: st.nx])))
     size = ca.fmax(ca.fabs(running + terminal), np.finfo(float).tiny)
-    rows = _rows(nlp, (x, u, duration, p), (e, passed)) if st.matrices else ca.MX(0.0)
+    rows = ca.MX(0.0)
+    if st.matrices:  # what is no number would be lost among comparisons
+        known = ca.sum1(ca.sum2(ca.fabs(passed))) <= LARGEST
+        rows = ca.if_else(known, _rows(nlp, (x, u, duration, p), (e, passed)), ca.inf)
     return ca.vertcat(ca.mmax(ca.vertcat(0.0, moved)), change / size, rows)
 
 
