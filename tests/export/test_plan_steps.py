@@ -222,3 +222,55 @@ def test_what_follows_something_in_time_is_exported(tmp_path) -> None:
     plan = quick(co.export_c(ocp, tmp_path / "tracking", intervals=20)).python().solve()
     assert plan["status"] == "OK"
     assert plan["cost"] == pytest.approx(co.solve(ocp, intervals=20, progress=False).cost, rel=1e-7)
+
+
+OBSTACLE, RADIUS = np.array([2.5, -0.05]), 0.5
+
+
+def round_an_obstacle(form: str) -> co.Problem:
+    """A point that flies past a circle."""
+    ocp = co.Problem(10.0, "obstacle")
+    p, u = ocp.state("p", 2, initial=[0.0, 0.0], final=[5.0, 0.0]), ocp.control("u", 2)
+    radius = ocp.parameter("radius", RADIUS)
+    ocp.dynamics(p, u)
+    apart = ca.sumsqr(p - OBSTACLE)
+    if form == "zero":
+        ocp.subject_to(radius**2 - apart, upper=0.0, name="obstacle")
+    else:
+        ocp.subject_to(apart, lower=RADIUS**2, name="obstacle")
+    ocp.minimize(running=0.5 * ca.sumsqr(u))
+    return ocp
+
+
+def clearance(plan: dict[str, Any]) -> float:
+    """The closest that it comes to the middle, u linear between the nodes."""
+    p, u, h = plan["p"].reshape(-1, 2), plan["u"].reshape(-1, 2), 10.0 / (len(plan["time"]) - 1)
+    s = np.linspace(0.0, 1.0, 101)[:, None]
+    paths = [p[i] + h * (s * u[i] + s**2 / 2 * (u[i + 1] - u[i])) for i in range(len(p) - 1)]
+    return float(np.linalg.norm(np.vstack(paths) - OBSTACLE, axis=1).min())
+
+
+@pytest.mark.parametrize("form", ["zero", "limit"])
+def test_a_plan_through_an_obstacle_between_two_nodes_is_not_ok(tmp_path, form: str) -> None:
+    """From 10 m away an interval is longer than the obstacle, and no node is in it."""
+    made = co.export_c(round_an_obstacle(form), tmp_path / "obstacle", intervals=20).reference()
+    for start, status in ((0.0, "OK"), (-5.0, "OK"), (-10.0, "COARSE"), (-20.0, "COARSE")):
+        plan = made.solve(initial_p=[start, 0.0])
+        assert plan["status"] == status
+        assert clearance(plan) > 0.98 * RADIUS if status == "OK" else clearance(plan) < 0.1 * RADIUS
+
+
+def test_bounds_of_states_are_looked_at_between_the_nodes(tmp_path) -> None:
+    """There and back in one interval, x = speed (t - t^2 / 2): it turns round at half the speed."""
+    ocp = co.Problem(2.0, "there and back")
+    x = ocp.state("x", initial=0.0, final=0.0, lower=-0.4, upper=0.4)
+    speed, u = ocp.parameter("speed", 0.1), ocp.control("u")
+    v = ocp.state("v", initial=speed, final=-speed)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=u**2)
+    made = co.export_c(ocp, tmp_path / "there", intervals=1).reference()
+    for at, status in ((0.1, "OK"), (0.7, "OK"), (1.0, "COARSE"), (3.0, "COARSE")):
+        plan = made.solve(initial_v=at, speed=at)
+        assert plan["cost"] == pytest.approx(2.0 * at**2, rel=1e-8)
+        assert plan["status"] == status

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -19,10 +20,13 @@ from covocp.extremal.polynomials import Dense
 from covocp.extremal.row_units import varied_by
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
+from covocp.statement.offsets import offset_of
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.scales import choose_scales
 
+# Problems whose rows are kept taken apart.
+KEPT = 8
 # Points that are looked at together: what bounds the memory.
 TOGETHER = 1 << 15
 # Share of a limit by which it may be passed between the points where it is imposed without a word.
@@ -154,8 +158,13 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
         x = _before(extremal, dense, k, s)[:, : st.nx]
         return np.hstack([x, _conditions(extremal, dense, st.path, k, s)]) if st.path.size else x
 
-    terms = np.concatenate([np.zeros(st.nx), _equation_terms(extremal)])
-    found = _passed(extremal, dense, points, names, limits, values, terms)
+    def sizes(when: Array, largest: Array) -> Array:
+        terms = np.concatenate([np.zeros(st.nx), _equation_terms(extremal)])
+        beside = _beside_zero(extremal, when[:, st.nx :])
+        own = np.where(beside > 0, np.minimum(beside, largest[st.nx :]), largest[st.nx :])
+        return np.where(terms > 0, terms, np.hstack([np.tile(largest[: st.nx], (2, 1)), own]))
+
+    found = _passed(extremal, dense, points, names, limits, values, sizes)
     zero = (np.array(limits) == 0.0).any(axis=0)
     if not found or not zero.any():
         return found
@@ -169,6 +178,25 @@ def _units(extremal: Extremal) -> Array:
     units = choose_scales(st, extremal.mesh, extremal.trajectory, extremal.parameters)
     rows = varied_by(extremal, st.path.function, units) if st.path.size else np.zeros(0)
     return np.concatenate([units.x, np.where(np.isfinite(rows), rows, 0.0)])
+
+
+@lru_cache(maxsize=KEPT)
+def _offset(statement: Statement) -> ca.Function | None:
+    """What the rows along the path compare with where their limits are zero; None: what that is cannot be told."""
+    path = statement.path
+    return offset_of(path) if ((path.lower == 0.0) | (path.upper == 0.0)).any() else None
+
+
+def _beside_zero(extremal: Extremal, when: Array) -> Array:
+    """Sizes of what the rows along the path compare with beside a limit of zero, at normalised times (2, rows)."""
+    offset = _offset(extremal.statement)
+    if offset is None:
+        return np.zeros(when.shape)
+    duration = extremal.trajectory.duration
+    fixed = repeated(duration, extremal.parameters, when.size)
+    found = np.abs(np.asarray(mapped(offset, duration * when.reshape(1, -1), *fixed)[0]))
+    rows = np.tile(np.arange(when.shape[1]), 2)
+    return np.asarray(np.nan_to_num(found[rows, np.arange(when.size)].reshape(when.shape)))
 
 
 def _equation_terms(extremal: Extremal) -> Array:
@@ -211,11 +239,12 @@ def _passed(
     names: Sequence[str],
     limits: tuple[Array, ...],
     values_at: Callable[[Any, Array], Array],
-    terms: Array | float = 0.0,
+    sizes_at: Callable[[Array, Array], Array] | None = None,
 ) -> tuple[Passed, ...]:
     """Rows that pass their limits along the true path, from what gives them at normalised times of intervals.
 
-    terms: sizes of what equations compare, 0 of other rows.
+    sizes_at: normalised times, of each limit (2, rows), and the largest value of each row -> what the rows compare
+        where a limit is zero; None: that value.
     """
     mesh, (lower, upper) = extremal.mesh, limits
     worst, largest, held = np.zeros((2, len(names))), np.zeros(len(names)), np.zeros(len(names))
@@ -235,7 +264,9 @@ def _passed(
             worst[side] = np.maximum(worst[side], found)
             there = np.where(lower == upper, _imposed(mesh, k, s, 1), _imposed(mesh, k, s, mesh.points))
             held = np.maximum(held, np.where(there, excess, 0.0).max(axis=0, initial=0.0))
-    shares = worst / limit_sizes(lower, upper, np.where(np.asarray(terms) > 0, terms, largest))
+    if sizes_at is not None and worst.any():
+        largest = sizes_at(when, largest)
+    shares = worst / limit_sizes(lower, upper, largest)
     side = shares.argmax(axis=0)
     result = [
         Passed(
@@ -281,7 +312,7 @@ def finite_sizes(values: Array) -> Array:
 def limit_sizes(lower: Array, upper: Array, largest: Array) -> Array:
     """What a violation is relative to, (2, rows): the limit, the width between both, the least of them.
 
-    Where the limit is zero, it is the largest value along the path.
+    Where the limit is zero, it is the largest value along the path, or what else is given for it.
     """
     limits = np.abs(np.array([lower, upper]))
     sizes = np.where(np.isfinite(limits) & (limits > 0), limits, largest)

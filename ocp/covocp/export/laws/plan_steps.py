@@ -19,26 +19,29 @@ from covocp.export.laws.law import LARGEST
 from covocp.passage.written import Tape
 from covocp.statement.conditions import Columns, Conditions
 from covocp.statement.interval import Interval
+from covocp.statement.offsets import offset_of
 from covocp.transcription.limit_units import ALONG, row_units
 from covocp.transcription.nlp import NLP
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import full_interval, nominal_interval
 
 # Change of a state at a node, relative to its range along the plan, of the cost, and of what conditions on covariances
-# compare, in units of their limits, above which steps are long.
+# compare, or what limits are passed by between nodes, in units of these limits, above which steps are long.
 NODES, COST, ROWS = 4e-3, 0.01, 0.01
 # So many times what steps are off at the export itself, which was told there, is allowed where that is more.
 AS_AT_EXPORT = 3.0
+# Parts of an interval, at least, at whose ends limits along the path are looked at.
+BETWEEN = 8
 # Range of what hardly varies, in its unit.
 LEAST_RANGE = 1e-3
 
 
 def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given, tape: Tape | None = None) -> Any:
-    """What halving the steps changes of a plan: of the states, of the cost, of conditions on covariances, (3, 1).
+    """What halving the steps changes of a plan: of the states, of the cost, of what limits compare, (3, 1).
 
     States count by what all intervals by themselves are off, together, or by one run along the controls where that is
     less: what a plant forgets is no error, and what an unstable one makes of an error is none of the steps. Covariances
-    pass once along all nodes of the plan.
+    pass once along all nodes of the plan. Limits along the path count by what they are passed by between the nodes, too.
 
     Args:
         nlp: the transcription.
@@ -80,7 +83,7 @@ def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given,
     if st.matrices:  # what is no number would be lost among comparisons
         known = ca.sum1(ca.sum2(ca.fabs(passed))) <= LARGEST
         rows = ca.if_else(known, _rows(nlp, (x, u, duration, p), (e, passed)), ca.inf)
-    return ca.vertcat(ca.mmax(ca.vertcat(0.0, moved)), change / size, rows)
+    return ca.vertcat(ca.mmax(ca.vertcat(0.0, moved)), change / size, ca.fmax(rows, _between(nlp, x, common, p)))
 
 
 def _passed(nlp: NLP, along: tuple[Any, ...], tape: Tape | None) -> tuple[Any, Any]:
@@ -120,6 +123,45 @@ def _rows(nlp: NLP, along: tuple[Any, ...], matrices: tuple[Any, Any]) -> Any:
         least = LEAST_RANGE * ca.DM(nlp.scales.e[known])
         changes.append(ca.mmax(ca.fabs(found - told) / ca.fmax(ca.fabs(told), least)))
     return ca.mmax(ca.vertcat(*changes))
+
+
+def _between(nlp: NLP, x: Expr, common: Interval, p: Given) -> Any:
+    """By how much limits along the path, of no matrices, are passed between the nodes, in units of these limits."""
+    st, mesh, path = nlp.statement, nlp.mesh, nlp.statement.path
+    own = path.size and not path.uses_matrices and not path.equations.all()
+    if st.coupled or not (own or st.bounded_states):
+        return ca.MX(0.0)
+    steps = mesh.substeps * -(-BETWEEN // mesh.substeps)
+    _, fine, _ = nominal_interval(st, steps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
+    inside = common.substeps(steps)
+    at = [k * steps + j for k in range(mesh.intervals) for j in range(1, steps)]
+    places, count = inside.columns(at), len(at)
+    states, time = fine[:, [k - 1 for k in at]], places.duration * places.s
+    found = [ca.MX(0.0)]
+    if own:
+        seen = Columns(states, places.start, ca.DM(st.ne, count), time)
+        values = path.columns(seen, common.duration[0], p)
+        unit, offset = ca.repmat(ca.DM(row_units(st, path, nlp.scales)), 1, count), offset_of(path)
+        if offset is not None and ((path.lower == 0.0) | (path.upper == 0.0)).any():
+            beside = ca.fabs(offset.map(count)(time, places.duration, ca.repmat(p, 1, count)))
+            silent = ca.repmat(ca.DM(((path.lower == 0.0) | (path.upper == 0.0)).astype(float)), 1, count)
+            unit = ca.if_else(ca.logic_and(silent, beside > 0), ca.fmin(unit, beside), unit)
+        free = np.where(path.equations, np.inf, 0.0)  # which hold at the nodes alone
+        found.append(_passed_by(values, path.lower - free, path.upper + free, unit))
+    bounded = st.bounded_states
+    if bounded:
+        lower, upper = (bound[bounded] for bound in st.state_bounds)
+        unit = ca.repmat(ca.DM(nlp.scales.x[bounded]), 1, count)
+        found.append(_passed_by(states[bounded, :], lower, upper, unit))
+    return ca.mmax(ca.vertcat(*found))
+
+
+def _passed_by(values: Expr, lower: Array, upper: Array, unit: Expr) -> Any:
+    """The most by which columns of values pass their limits, in units of their own; inf where one is no number."""
+    numbers = (np.nan_to_num(limit, posinf=LARGEST, neginf=-LARGEST) for limit in (lower, upper))
+    low, high = (ca.repmat(ca.DM(limit), 1, values.shape[1]) for limit in numbers)
+    share = ca.fmax(low - values, values - high) / unit
+    return ca.if_else(ca.mmin(share <= LARGEST), ca.fmax(0.0, ca.mmax(share)), ca.inf)
 
 
 def _conditions(nlp: NLP) -> Iterator[tuple[Conditions, list[int], tuple[float, ...]]]:
