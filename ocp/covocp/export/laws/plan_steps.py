@@ -41,7 +41,7 @@ def changes_by_halves(nlp: NLP, p: Given, evaluated: Sequence[Any], held: Given,
 
     States count by what all intervals by themselves are off, together, or by one run along the controls where that is
     less: what a plant forgets is no error, and what an unstable one makes of an error is none of the steps. Covariances
-    pass once along all nodes of the plan. Limits along the path count by what they are passed by between the nodes, too.
+    pass once along all nodes of the plan. Limits along the path count by what passes them between the nodes, too.
 
     Args:
         nlp: the transcription.
