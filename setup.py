@@ -3,7 +3,9 @@
 Without symbolic links in the checkout the two linked folders are mapped from where they lie.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
@@ -14,13 +16,20 @@ FLAGS = ["-g0", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
 
 class BuildPassage(build_ext):
-    """Flags of the compiler that is there."""
+    """Flags of the compiler that is there, and files beside one another."""
 
     def build_extensions(self) -> None:
         """Compile with them."""
         if self.compiler.compiler_type in ("unix", "mingw32"):
             for extension in self.extensions:
                 extension.extra_compile_args = FLAGS
+            one = self.compiler.compile
+
+            def compile_all(sources: list[str], *args: Any, **options: Any) -> list[str]:
+                with ThreadPoolExecutor() as threads:
+                    return sum(threads.map(lambda source: one([source], *args, **options), sources), [])
+
+            self.compiler.compile = compile_all
         super().build_extensions()
 
 
