@@ -27,7 +27,8 @@ class BuildPassage(build_ext):
 
             def compile_all(sources: list[str], *args: Any, **options: Any) -> list[str]:
                 with ThreadPoolExecutor() as threads:
-                    return sum(threads.map(lambda source: one([source], *args, **options), sources), [])
+                    made = threads.map(lambda source: one([source], *args, **options), sources)
+                    return [name for names in made for name in names]
 
             self.compiler.compile = compile_all
         super().build_extensions()
