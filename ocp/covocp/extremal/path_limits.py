@@ -184,7 +184,7 @@ def _units(extremal: Extremal) -> Array:
 def _offset(statement: Statement) -> ca.Function | None:
     """What the rows along the path compare with where their limits are zero; None: what that is cannot be told."""
     path = statement.path
-    return offset_of(path) if ((path.lower == 0.0) | (path.upper == 0.0)).any() else None
+    return offset_of(path) if path.of_zero.any() else None
 
 
 def _beside_zero(extremal: Extremal, when: Array) -> Array:

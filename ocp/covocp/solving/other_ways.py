@@ -30,7 +30,7 @@ from covocp.transcription.stiffness import stiffness
 # Iterations with other steps: what finds a way by them mostly takes fewer, and each takes long.
 MOST_ITERATIONS = 150
 # Logarithm of what grows in an interval above which its length is the likely reason of a failure, and what is borne:
-# a double integrator with a spring that pushes, over 400 to 2000 of its time constants.
+# of a double integrator with a spring that pushes exp(10) to an interval is solved, exp(20) is not.
 MOST_GROWN, GROWN = 15.0, 8.0
 STEPS: dict[str, Any] = {"covariance_step": "gauss"}
 HESSIAN: dict[str, Any] = {"hessian": "limited-memory"}

@@ -65,6 +65,11 @@ class Conditions:
         """Which rows have both limits equal."""
         return np.asarray(self.lower == self.upper)
 
+    @property
+    def of_zero(self) -> NDArray[np.bool_]:
+        """Which rows have a limit of zero."""
+        return np.asarray((self.lower == 0.0) | (self.upper == 0.0))
+
     def columns(self, at: Columns, duration: Expr, parameters: Expr) -> Any:
         """The values for columns of points; matrices that no row reads are no part of the expression.
 

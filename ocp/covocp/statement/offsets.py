@@ -8,6 +8,9 @@ import casadi as ca
 
 from covocp.statement.conditions import Conditions
 
+# Terms of a row that are taken apart: of sums that share sums there may be too many.
+MOST_TERMS = 10_000
+
 
 def offset_of(conditions: Conditions) -> ca.Function | None:
     """(time, duration, parameters) -> the sum of the terms of each row in which no state, control or matrix is.
@@ -26,9 +29,14 @@ def offset_of(conditions: Conditions) -> ca.Function | None:
 
 
 def _free_of(row: ca.SX, variables: ca.SX) -> ca.SX:
-    """The terms of a sum that are free of some variables; a product with what is free of them is taken apart, too."""
+    """The terms of a sum that are free of some variables; a product with what is free of them is taken apart, too.
+
+    None of them where there are too many.
+    """
     total, left = ca.SX(0.0), [(row, ca.SX(1.0))]
-    while left:
+    for _ in range(MOST_TERMS):
+        if not left:
+            return total
         value, factor = left.pop()
         if not ca.depends_on(value, variables):
             total += factor * value
@@ -45,4 +53,4 @@ def _free_of(row: ca.SX, variables: ca.SX) -> ca.SX:
             left.append((deps[0], factor * deps[1] if kind == ca.OP_MUL else factor / deps[1]))
         elif kind == ca.OP_MUL and not ca.depends_on(deps[0], variables):
             left.append((deps[1], factor * deps[0]))
-    return total
+    return ca.SX(0.0)

@@ -40,8 +40,8 @@ STATUSES = {
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
     "COARSE": "the conditions hold, but the mesh of the export is too coarse for what was given (a faster plant, a "
     "longer time) or too coarse for so much uncertainty at the start: halves of its steps would move a state by more "
-    "than 0.4 % of its range, or its cost is off by more than about 1 %; export the solver for such values, or with "
-    "more substeps",
+    "than 0.4 % of its range, its cost or what limits a covariance is off by more than about 1 %, or a limit is passed "
+    "by that between the nodes; export the solver for such values, or with more substeps or intervals",
     "SAMPLES_SKIPPED": "samples before this one were left out: they are predicted over, but the measurement is weighed "
     "by the gain of one period; the estimate is less certain than the design says until steps are of one period again",
     "READING_IGNORED": "another call at the sample of the last one: its reading is not used",

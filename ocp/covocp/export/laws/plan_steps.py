@@ -141,11 +141,12 @@ def _between(nlp: NLP, x: Expr, common: Interval, p: Given) -> Any:
     if own:
         seen = Columns(states, places.start, ca.DM(st.ne, count), time)
         values = path.columns(seen, common.duration[0], p)
-        unit, offset = ca.repmat(ca.DM(row_units(st, path, nlp.scales)), 1, count), offset_of(path)
-        if offset is not None and ((path.lower == 0.0) | (path.upper == 0.0)).any():
+        unit = ca.repmat(ca.DM(row_units(st, path, nlp.scales)), 1, count)
+        offset = offset_of(path) if path.of_zero.any() else None
+        if offset is not None:
             beside = ca.fabs(offset.map(count)(time, places.duration, ca.repmat(p, 1, count)))
-            silent = ca.repmat(ca.DM(((path.lower == 0.0) | (path.upper == 0.0)).astype(float)), 1, count)
-            unit = ca.if_else(ca.logic_and(silent, beside > 0), ca.fmin(unit, beside), unit)
+            of_zero = ca.repmat(ca.DM(path.of_zero.astype(float)), 1, count)
+            unit = ca.if_else(ca.logic_and(of_zero, beside > 0), ca.fmin(unit, beside), unit)
         free = np.where(path.equations, np.inf, 0.0)  # which hold at the nodes alone
         found.append(_passed_by(values, path.lower - free, path.upper + free, unit))
     bounded = st.bounded_states
